@@ -2,8 +2,6 @@
 
 import errno
 import os
-import subprocess
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -93,27 +91,3 @@ def test_without_room_for_the_index_all_messages_are_there(tmp_path: Path, monke
     failure = file.finish()
     assert failure is not None and failure.errno == errno.EIO
     assert whole_messages(tmp_path / "a.mcap") == [payload for _, payload in sent]
-
-
-@pytest.fixture
-def small_disk(tmp_path: Path) -> Iterator[Path]:
-    """A real file system of 3 MB."""
-    folder = tmp_path / "disk"
-    folder.mkdir()
-    done = subprocess.run(["mount", "-t", "tmpfs", "-o", "size=3m", "tmpfs", folder], capture_output=True, text=True)
-    if done.returncode:
-        pytest.skip(f"a tmpfs cannot be mounted here: {done.stderr.strip()}")
-    yield folder
-    subprocess.run(["umount", folder], check=True)
-
-
-def test_real_full_disk(small_disk: Path) -> None:
-    file = McapWriter(small_disk / "a.mcap")
-    channel = file.add_channel("/a", file.add_schema(BOOL), {})
-    with pytest.raises(OSError) as caught:
-        for index in range(100):
-            file.write(channel, index, bytes([index]) * 100_000)
-    assert caught.value.errno == errno.ENOSPC
-    file.finish()
-    got = whole_messages(small_disk / "a.mcap")
-    assert len(got) >= 11 and [data[0] for data in got] == list(range(len(got)))

@@ -100,14 +100,3 @@ def test_a_full_disk_is_told_while_it_records_and_when_it_ends(tmp_path: Path) -
     assert "only 1 MB are free" in source.recordings.status()["error"]
     with pytest.raises(BagError, match="only 1 MB are free"):
         source.recordings.close()
-
-
-def test_a_folder_that_cannot_be_made_is_told_and_the_next_try_counts(tmp_path: Path) -> None:
-    (tmp_path / "file").write_text("")
-    source = Source(tmp_path / "file")
-    with pytest.raises(BagError):
-        source.recordings.start()
-    assert source.recordings.status()["state"] == "idle"
-    source.recordings.folder = tmp_path
-    source.recordings.start()
-    source.recordings.close()

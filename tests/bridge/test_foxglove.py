@@ -338,14 +338,6 @@ def test_a_port_in_use_is_reported(tmp_path):
             LiveNode(tmp_path, FoxgloveBridgeNode, FoxgloveBridgeConfig(port=port), "foxglove_bridge")
 
 
-def test_nothing_is_left_after_the_end(world):
-    node = world.bridge()
-    world.live.close()
-    assert registry.list_topics(world.run_dir) == []
-    with pytest.raises(OSError, match="refused"):
-        socket.create_connection(("127.0.0.1", node.server.port), 2)
-
-
 # -- against foxglove-sdk's own server -----------------------------------------------------------------
 
 

@@ -9,7 +9,6 @@ import time
 import pytest
 import zmq
 
-from benchmarks.impaired_link import ImpairedLink, Impairment
 from instant_ic.bridge.commands import COMMANDS
 from instant_ic.bridge.host_connector import ConnectingLink
 from instant_ic.bridge.host_keys import KeyStore, Peer
@@ -223,23 +222,6 @@ def test_nobody_at_the_address_is_told_and_waited_for(ends, keys):
     assert b.of(LinkProblem)[-1].text == ""
 
 
-def test_link_over_ipv6(ends, keys):
-    try:
-        socket.create_server(("::1", 0), family=socket.AF_INET6).close()
-    except OSError:
-        pytest.skip("this machine has no IPv6")
-    a = End(
-        ListeningLink, "tcp://[::1]:0", name="robot", store=keys["robot"], exports=[STATE], imports=[COMMAND]
-    )  # fmt: skip
-    b = End(
-        ConnectingLink, f"tcp://[::1]:{a.link.port}", keys["station"].peer(), name="station", store=keys["station"],
-        exports=[COMMAND], imports=[STATE],
-    )  # fmt: skip
-    ends += [a, b]
-    linked(a, b)
-    assert a.link.peers()[0].address == "::1"
-
-
 def test_robot_that_starts_anew_is_met_again(ends, keys):
     a = robot(ends, keys)
     port = a.link.port
@@ -252,23 +234,6 @@ def test_robot_that_starts_anew_is_met_again(ends, keys):
     linked(again, b)
     b.send("/operator/cmd_vel", b"go")
     wait_for(lambda: again.payloads("/operator/cmd_vel"), "command")
-
-
-def test_hole_in_the_network_is_noticed_and_left_behind(ends, keys):
-    a = robot(ends, keys)
-    with ImpairedLink(("127.0.0.1", a.link.port), Impairment(delay_s=0.01)) as network:
-        b = station(ends, keys, network.port)
-        linked(a, b)
-        network.cut()
-        wait_for(lambda: a.of(Ended) and b.of(Ended), "end")
-        assert a.of(Ended)[0].code == "timeout"
-        for index in range(50):  # while it is away: nothing of this may arrive late
-            a.send("/camera", bytes([index]) * 1000)
-        network.mend()
-        linked(a, b)
-        a.send("/camera", b"new")
-        wait_for(lambda: b.payloads("/camera"), "picture")
-        assert b.payloads("/camera") == [b"new"]
 
 
 def test_command_that_was_old_before_it_reached_the_bridge_is_dropped(ends, keys):

@@ -1,7 +1,6 @@
 """The gateway between our bus and Zenoh: against raw Zenoh sessions, an independent client, and itself."""
 
 import os
-import sys
 import threading
 import time
 
@@ -449,12 +448,6 @@ def test_a_client_waits_for_its_router_and_finds_it(tmp_path_factory, monkeypatc
         wait_for(lambda: "no router answers" in gateway.told("link"), "words about the router's end")
     finally:
         gateway.close()
-
-
-def test_without_the_extra_the_error_names_what_to_install(monkeypatch, tmp_path_factory):
-    monkeypatch.setitem(sys.modules, "zenoh", None)
-    with pytest.raises(NodeError, match=r"pip install 'instant-ic\[zenoh\]'"):
-        LiveNode(tmp_path_factory.mktemp("r"), ZenohGatewayNode, ZenohGatewayConfig(), "zenoh_gateway")
 
 
 @pytest.mark.parametrize(

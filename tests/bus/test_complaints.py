@@ -398,18 +398,6 @@ def test_reader_goes_on_after_it_held_all_it_may_hold(bus: Bus, qos: QoS) -> Non
         assert reader.numbers() == list(range(1, last + 1))
 
 
-def test_view_outlives_its_subscription(bus: Bus) -> None:
-    out, reader = bus.publisher(), bus.reader()
-    wait_for(lambda: out.subscriber_count == 1)
-    out.send(numbered(1, LARGE))
-    message = wait_for(reader.poll)[0]
-    reader.raw.close()
-    for i in range(2, 30):
-        out.send(numbered(i, LARGE))
-    assert number(message) == 1 and whole(message)
-    wait_for(lambda: out.subscriber_count == 0)
-
-
 def test_full_disk_under_the_run_directory_is_told(bus: Bus, monkeypatch: pytest.MonkeyPatch) -> None:
     def full(*_: object, **__: object) -> None:
         raise OSError(errno.ENOSPC, "No space left on device")

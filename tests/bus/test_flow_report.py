@@ -66,17 +66,6 @@ def test_refused_and_overwritten_messages_are_an_error_with_the_cause_while_they
     assert topic.at(51)[0] == OK
 
 
-def test_large_messages_without_shared_memory_are_a_warning_while_there_are_new_ones():
-    topic = Topic()
-    assert topic.output_at(1) is None
-    topic.sent.not_shared, topic.sent.not_shared_why = 4, "No space left on device"
-    assert topic.output_at(2)[0] == OK
-    topic.sent.not_shared = 6
-    text = "in the last 10 s 2 large messages without shared memory: No space left on device"
-    assert topic.output_at(30) == (WARN, text)
-    assert topic.output_at(41)[0] == OK
-
-
 class Once(Node[None]):
     """Fails at its first message."""
 

@@ -11,7 +11,7 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
-from local_bus import BYTES
+from local_bus import BYTES, wait_for
 
 from instant_ic.bus import LATCHED, RELIABLE, SENSOR, RegistryError, local_subscription, registry
 from instant_ic.bus.local_transport import LocalTransport
@@ -33,14 +33,6 @@ def start_talker(run_dir: Path, *arguments: str) -> subprocess.Popen[str]:
     return subprocess.Popen(
         [sys.executable, str(TALKER), *arguments], env=environment, stderr=subprocess.PIPE, text=True
     )
-
-
-def wait_for(condition, timeout_s: float = 30.0):
-    deadline = time.monotonic() + timeout_s
-    while not (value := condition()):
-        assert time.monotonic() < deadline, "waited too long"
-        time.sleep(0.01)
-    return value
 
 
 class Inbox:
@@ -150,13 +142,6 @@ def test_publisher_that_leaves_the_registry_long_after_the_last_look_is_heard_fo
         sender.close()
 
 
-def test_folder_that_just_changed_is_not_settled():
-    now_ns = time.time_ns()
-    assert not registry.settled(now_ns)
-    assert registry.settled(now_ns - 1_000_000_000)
-    assert registry.settled(now_ns + 1_000_000_000)  # the clock was set back: no look five times a second until then
-
-
 def test_sweep_clears_what_the_dead_left_and_nothing_else(transport, talker, run_dir):
     process = talker()
     wait_for(lambda: len(registry.list_topics(run_dir)) >= 5)
@@ -256,19 +241,6 @@ def test_signal_while_the_loop_holds_its_lock_does_not_hang(run_dir):
     assert done.returncode == 0, done.stderr
     assert "left in order" in done.stderr
     assert list(run_dir.glob("topics/*/*.sock")) == []
-
-
-def test_an_event_that_is_written_late_ends_one_wait_not_all(bus):
-    """`clear` may come between a `set` and its write in another thread; the node would then spin until the next one."""
-    transport = bus.node("reader")
-    ends: list[None] = []
-    os.eventfd_write(transport._wake, 1)
-    deadline = time.monotonic() + 0.3
-    while time.monotonic() < deadline:
-        transport.wait(0.1)
-        transport.clear()
-        ends.append(None)
-    assert len(ends) <= 6
 
 
 def test_an_event_during_a_long_callback_does_not_keep_the_bus_thread_busy(bus, monkeypatch):
