@@ -7,7 +7,7 @@ from types import SimpleNamespace
 
 import yaml
 
-from instant_ic.bag.errors import BagError
+from instant_ic.bag.message import BagError
 from instant_ic.config.yaml_text import compose_yaml
 
 MOST_CHUNK_BYTES = 256 << 20

@@ -12,9 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from instant_ic.bag.errors import BagError
 from instant_ic.bag.files import BagReader
-from instant_ic.bag.message import BagMessage
+from instant_ic.bag.message import BagError, BagMessage
 
 
 @dataclass(frozen=True)

@@ -15,9 +15,8 @@ from rosbags.interfaces import Connection
 from rosbags.rosbag2 import Reader, ReaderError
 
 from instant_ic.bag.bounded import guard_rosbags, refuse_compression
-from instant_ic.bag.errors import BagError
 from instant_ic.bag.mcap_writer import Schema
-from instant_ic.bag.message import BagMessage
+from instant_ic.bag.message import BagError, BagMessage
 from instant_ic.bag.metadata import REPEATED, preset_of, schema_of, schema_or_unknown, store_of
 from instant_ic.bag.upgrade import upgrade_of
 from instant_ic.bus.qos import QoS

@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable, Collection, Mapping
 from pathlib import Path
 
-from instant_ic.bag.errors import BagError
+from instant_ic.bag.message import BagError
 from instant_ic.bus.heartbeat import EVERY_NODES
 from instant_ic.bus.registry import NodeInfo, TopicInfo, TopicWatch, list_nodes
 from instant_ic.bus.topics import Publisher

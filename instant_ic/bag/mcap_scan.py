@@ -21,8 +21,8 @@ from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
 
 from instant_ic.bag.bounded import decompress
-from instant_ic.bag.errors import BagError
 from instant_ic.bag.mcap_writer import LIBRARY, MAGIC, Schema
+from instant_ic.bag.message import BagError
 
 _MOST_DAMAGED = 1000
 """Damaged records that are listed; a hostile file may contain nothing else."""

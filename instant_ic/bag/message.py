@@ -1,10 +1,18 @@
-"""One message, as every part of the package handles it: bytes with topic, type, stamp and QoS."""
+"""One message, as every part of the package handles it: bytes with topic, type, stamp and QoS. Errors of bags."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
 from instant_ic.bus.qos import QoS
+
+
+class BagError(RuntimeError):
+    """A bag cannot be written or read; the message says why and what to do."""
+
+
+class DiskFullError(BagError):
+    """No space left on the disk. The bag is complete except for the messages that did not fit."""
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ from collections.abc import Callable, Collection
 from pathlib import Path
 from typing import Any
 
-from instant_ic.bag.errors import BagError
+from instant_ic.bag.message import BagError
 from instant_ic.bag.recorder import Recorder, dated
 from instant_ic.bag.recorder_thread import on_disk
 from instant_ic.bus.registry import NodeInfo, TopicInfo

@@ -10,10 +10,9 @@ from pathlib import Path
 from typing import Annotated, Any
 
 from instant_ic.bag.choice import TopicChoice
-from instant_ic.bag.errors import BagError
 from instant_ic.bag.files import BagReader, TopicSummary
 from instant_ic.bag.latched import LatchedValues
-from instant_ic.bag.message import BagMessage
+from instant_ic.bag.message import BagError, BagMessage
 from instant_ic.bag.metadata import schema_or_unknown
 from instant_ic.bag.upgrade import upgrade_of
 from instant_ic.bus.heartbeat import EVERY_NODES

@@ -18,9 +18,8 @@ from pathlib import Path
 from typing import Annotated, Any
 
 from instant_ic.bag.choice import TopicChoice
-from instant_ic.bag.errors import BagError
 from instant_ic.bag.latched import LatchedValues
-from instant_ic.bag.message import BagMessage
+from instant_ic.bag.message import BagError, BagMessage
 from instant_ic.bag.recorder_thread import (
     DISK_FULL,
     FAILED,

@@ -11,8 +11,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-from instant_ic.bag.errors import BagError, DiskFullError
-from instant_ic.bag.message import BagMessage
+from instant_ic.bag.message import BagError, BagMessage, DiskFullError
 from instant_ic.bag.writer import BagWriter
 
 FLUSH_S = 1.0

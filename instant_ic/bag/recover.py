@@ -6,8 +6,8 @@ import re
 from dataclasses import dataclass
 from pathlib import Path
 
-from instant_ic.bag.errors import BagError
 from instant_ic.bag.mcap_scan import McapScan
+from instant_ic.bag.message import BagError
 from instant_ic.bag.metadata import preset_of_text, with_hash
 from instant_ic.bag.writer import CUSTOM_RECORD, BagWriter
 

@@ -12,9 +12,8 @@ from typing import Any
 
 import yaml
 
-from instant_ic.bag.errors import BagError
 from instant_ic.bag.files import BagReader
-from instant_ic.bag.message import BagMessage
+from instant_ic.bag.message import BagError, BagMessage
 from instant_ic.bag.player import NEVER_PLAYED
 from instant_ic.bag.transforms import TRANSFORM_TOPICS, without_children
 from instant_ic.bag.writer import BagWriter

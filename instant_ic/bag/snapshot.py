@@ -8,9 +8,8 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from instant_ic.bag.errors import BagError
 from instant_ic.bag.latched import LatchedValues
-from instant_ic.bag.message import BagMessage
+from instant_ic.bag.message import BagError, BagMessage
 from instant_ic.bag.writer import BagWriter
 
 log = logging.getLogger(__name__)

@@ -8,10 +8,9 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from instant_ic.bag.errors import BagError, DiskFullError
 from instant_ic.bag.latched import LatchedValues
 from instant_ic.bag.mcap_writer import Buffer, McapWriter, Schema
-from instant_ic.bag.message import BagMessage
+from instant_ic.bag.message import BagError, BagMessage, DiskFullError
 from instant_ic.bag.metadata import PartInfo, Topic, channel_metadata, schema_or_unknown, write_metadata
 from instant_ic.bus.qos import SENSOR, QoS
 from instant_ic.util.closing import Closing

@@ -22,32 +22,30 @@ class Callbacks:
         diagnostics: where exceptions are reported.
         wake: ends the node's wait for messages.
         lockstep: an exception is raised again after it has been reported.
+
+    Attributes:
+        soon: functions of :meth:`call_soon` that wait, with their arguments.
     """
 
     def __init__(self, diagnostics: Diagnostics, wake: Callable[[], None], lockstep: bool) -> None:
         self._diagnostics = diagnostics
         self._wake = wake
         self._lockstep = lockstep
-        self._soon: deque[tuple[Callable[..., None], tuple[Any, ...]]] = deque()
+        self.soon: deque[tuple[Callable[..., None], tuple[Any, ...]]] = deque()
         self._failed_at: dict[str, float] = {}  # callback or timer -> monotonic time of its newest exception
         self._running: tuple[str, float] | None = None
         self._faults = 0
 
-    @property
-    def waiting(self) -> bool:
-        """True while functions of :meth:`call_soon` wait."""
-        return bool(self._soon)
-
     def call_soon(self, function: Callable[..., None], *args: Any) -> None:
         """Run a function on the node's thread; may be called from any thread."""
-        self._soon.append((function, args))
+        self.soon.append((function, args))
         self._wake()
 
     def run_soon(self) -> bool:
         """Run the functions of :meth:`call_soon`; return whether there were any."""
         ran = False
-        while self._soon:
-            function, args = self._soon.popleft()
+        while self.soon:
+            function, args = self.soon.popleft()
             label = getattr(function, "__qualname__", "callback")
             self.run(label, function, *args)
             self._failed_at.pop(label, None)  # called once: that another call succeeds mends nothing

@@ -16,7 +16,7 @@ from instant_ic.bus.frame import HEADER, INLINE, KEY_COPY, MARK, MOST_BYTES, REF
 from instant_ic.bus.host import Host
 from instant_ic.bus.qos import QoS
 from instant_ic.bus.shm import LEAST_SLOTS, PeerProgress, Slot, SlotPool
-from instant_ic.bus.transport import Buffer, Payload, PublisherStats, TransportError, joined
+from instant_ic.bus.transport import Buffer, PublisherStats, TransportError
 
 SHARED_FROM_BYTES = 96 << 10
 """Messages of this size and more go through shared memory. Below it, copying through a socket costs less than the
@@ -85,15 +85,13 @@ class LocalPublisher:
         self.fd = int(self._socket.getsockopt(zmq.FD))
         self._send_part = super(zmq.Socket, self._socket).send  # without pyzmq's layer for other kinds of sockets
 
-    def send(self, payload: Payload, publish_ns: int | None = None) -> None:
+    def send(self, payload: Buffer, publish_ns: int | None = None) -> None:
         """Send one message without waiting. The payload may be changed as soon as this returns.
 
         Raises:
             TransportError: the message is larger than 4 GiB.
         """
-        body = joined(payload)
-        if not isinstance(body, bytes):
-            body = body.cast("B")
+        body = payload if isinstance(payload, bytes) else memoryview(payload).cast("B")
         size = len(body)
         if size >= SHARED_FROM_BYTES:
 

@@ -20,10 +20,8 @@ from instant_ic.bus import registry
 from instant_ic.bus.frame import (
     INLINE,
     KEY_COPY,
-    MAGIC,
     REFERENCE,
     SHARED,
-    VERSION,
     FrameError,
     Header,
     type_digest,
@@ -157,9 +155,7 @@ class LocalSubscription:
             except (FrameError, zmq.Again) as error:
                 text = str(error) or "message in parts"
                 while socket.getsockopt(zmq.RCVMORE):
-                    part = receive(_NOBLOCK)
-                    if part.startswith(MAGIC) and part[4:5] < bytes([VERSION]):  # the header was a part of its own
-                        text = f"wire format {part[4]}, not {VERSION}: start all nodes again with one Instant IC"
+                    receive(_NOBLOCK)
                 self._reject(text)
                 self._complain(text[:40], f"{text}; the message is dropped")
             if one:

@@ -18,7 +18,7 @@ from typing import Any, TypeVar
 from instant_ic.bus.clock import ManualClock
 from instant_ic.bus.node import Node
 from instant_ic.bus.qos import LATCHED, QoS
-from instant_ic.bus.transport import Payload, PublisherStats, Received, Stats, joined
+from instant_ic.bus.transport import Buffer, PublisherStats, Received, Stats
 from instant_ic.msg import deserialize, serialize, type_name
 from instant_ic.util.closing import Closing
 
@@ -51,8 +51,8 @@ class _Publisher:
     def subscriber_count(self) -> int:
         return len(self._bus.subscriptions.get(self.topic, ()))
 
-    def send(self, payload: Payload, publish_ns: int | None = None) -> None:
-        data = bytes(joined(payload))
+    def send(self, payload: Buffer, publish_ns: int | None = None) -> None:
+        data = bytes(payload)
         self.stats.add(self._bus.clock.steady_ns())
         self._bus.route(self.topic, self.type_name, data, self._node, self.qos, publish_ns, self._instance)
 
@@ -302,4 +302,4 @@ class LockstepBus(Closing):
     def _due(self, node: Node[Any]) -> bool:
         """Return whether results of workers or timers are due."""
         timer_ns = node.timers.next_ns()
-        return node.callbacks.waiting or (timer_ns is not None and timer_ns <= self.clock.steady_ns())
+        return bool(node.callbacks.soon) or (timer_ns is not None and timer_ns <= self.clock.steady_ns())

@@ -292,7 +292,7 @@ class Node(Generic[ConfigT]):
                 due_s = (timer_ns - self.clock.steady_ns()) / 1e9
                 # Simulated time may run slower or faster than the machine's, so its timers are checked often.
                 wait = min(wait, 0.01 if self.use_sim_time else current().wait_s(due_s))
-            if not self.callbacks.waiting:
+            if not self.callbacks.soon:
                 self._transport.wait(max(0.0, wait))
 
     def spin_once(self) -> bool:
@@ -311,7 +311,7 @@ class Node(Generic[ConfigT]):
         return ran
 
     def _run_arrived(self) -> bool:
-        ran = self.callbacks.run_soon()
+        ran = bool(self.callbacks.soon) and self.callbacks.run_soon()
         pending: list[tuple[int, Subscription, Received]] = []
         for subscription in self.subscriptions if self._simulated_time is None else self._simulated_time.inputs():
             for received in subscription.raw.take():

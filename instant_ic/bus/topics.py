@@ -6,7 +6,7 @@ from collections.abc import Callable
 from typing import Any
 
 from instant_ic.bus.clock import Clock
-from instant_ic.bus.transport import Payload, RawPublisher, RawSubscription, Received
+from instant_ic.bus.transport import Buffer, RawPublisher, RawSubscription, Received
 from instant_ic.msg import MessageError, serializer, stamp_ns, type_name
 
 WENT_BACK_NS = 100_000_000
@@ -35,8 +35,8 @@ class Publisher:
             raise MessageError(f"{self.topic} carries {self.raw.type_name}, not {type_name(message)}")
         self.raw.send_filled(*serializer(message))
 
-    def publish_bytes(self, payload: Payload, publish_ns: int | None = None) -> None:
-        """Send CDR bytes as they are: one buffer, or several in a row.
+    def publish_bytes(self, payload: Buffer, publish_ns: int | None = None) -> None:
+        """Send CDR bytes as they are.
 
         Args:
             payload: must not be changed afterwards; it may still be on its way.

@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple, Protocol
 
 from instant_ic.bus.qos import QoS
 
 Buffer = bytes | bytearray | memoryview
-
-Payload = Buffer | Sequence[Buffer]
-"""CDR bytes: one buffer, or several in a row."""
 
 
 class TransportError(RuntimeError):
@@ -122,7 +119,7 @@ class RawPublisher(Protocol):
 
     @property
     def subscriber_count(self) -> int: ...
-    def send(self, payload: Payload, publish_ns: int | None = None) -> None:
+    def send(self, payload: Buffer, publish_ns: int | None = None) -> None:
         """Send one message; ``publish_ns`` keeps the publication time of a forwarded message."""
         ...
 
@@ -131,13 +128,6 @@ class RawPublisher(Protocol):
         ...
 
     def close(self) -> None: ...
-
-
-def joined(payload: Payload) -> bytes | memoryview:
-    """Return a payload as one buffer; copied only if it consists of several."""
-    if isinstance(payload, (bytes, memoryview)):
-        return payload
-    return memoryview(payload) if isinstance(payload, bytearray) else b"".join(payload)
 
 
 class RawSubscription(Protocol):

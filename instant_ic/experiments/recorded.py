@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from instant_ic.bag.errors import BagError
 from instant_ic.bag.files import BagReader
+from instant_ic.bag.message import BagError
 from instant_ic.experiments.plots import perspective_crop
 from instant_ic.experiments.vspace_sources import Shot, VspaceSettings
 from instant_ic.msg import deserialize
