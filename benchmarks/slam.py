@@ -19,6 +19,7 @@ from pathlib import Path
 
 import numpy as np
 from reporting import note, parser_for, report
+from slam_faults import FAULTS, evaluate_faults
 from slam_worlds import LASERS, cells, drive, ring
 
 from instant_ic.experiments.slam import (
@@ -28,8 +29,7 @@ from instant_ic.experiments.slam import (
     read_stamps,
     trajectory_errors,
 )
-from instant_ic.experiments.slam_faults import FAULTS, evaluate_faults
-from instant_ic.experiments.slam_logs import LogEntry, read_log
+from instant_ic.experiments.slam_logs import LogEntry, is_bag, read_bag, read_log
 from instant_ic.experiments.slam_sim import round_trip
 from instant_ic.geometry.poses import compose2, relative2
 from instant_ic.sim.worlds import make_world
@@ -149,7 +149,8 @@ def named_log(name: str, data: Path) -> list[LogEntry]:
         return round_trip(make_world("corridor"), 0.2, int(seed or 0)).entries
     if kind == "ring":
         return drive(*ring(int(seed or 0)), LASERS["sick180"], int(seed or 0)).entries
-    return list(read_log(data / name))
+    path = data / name
+    return list(read_bag(path) if is_bag(path) else read_log(path))
 
 
 def main() -> None:
@@ -158,7 +159,11 @@ def main() -> None:
     default = Path(__file__).resolve().parents[2] / "shared" / "data" / "slam2d"
     parser.add_argument("--data", type=Path, default=default, help="folder of the logs (default ../shared/data/slam2d)")
     parser.add_argument("--only", nargs="+", choices=(*parts, "faults"), default=parts)
-    parser.add_argument("--log", metavar="NAME", help="of faults: a file in --data, crawler:SEED, ring:SEED")
+    parser.add_argument(
+        "--log",
+        metavar="NAME",
+        help="of faults: a log or bag (its path, or its name in --data), crawler:SEED, ring:SEED",
+    )
     parser.add_argument("--first", type=int, metavar="N", help="of faults: only the first N scans")
     parser.add_argument("--faults", nargs="+", choices=FAULTS, default=FAULTS, metavar="NAME")
     parser.add_argument("--places", type=int, default=6, metavar="N")

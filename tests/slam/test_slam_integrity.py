@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from instant_ic.experiments.slam_faults import evaluate_faults, kidnap
+from benchmarks.slam_faults import evaluate_faults, kidnap
 from instant_ic.experiments.slam_logs import LogEntry
 from instant_ic.experiments.slam_sim import round_trip
 from instant_ic.sim.worlds import make_world

@@ -55,19 +55,13 @@ def _add_slam(kinds: Any) -> None:
     text = "one parameter of grid_slam"
     add("-p", "--param", action="append", default=[], metavar="KEY:=VALUE", help=text)
     add("--no-odometry", action="store_true", help="ignore the log's odometry")
-    text = "put faults into the log instead (all, or the named ones): detection, recovery and false alarms by fault"
-    add("--faults", nargs="?", const="all", metavar="NAME,...", help=text)
-    text = "of --faults: places for each (default: %(default)d)"
-    add("--places", type=positive_int, metavar="N", default=5, help=text)
-    add("--seed", type=int, default=0, metavar="N", help="of --faults: chooses the places (default: %(default)d)")
 
 
 def evaluate_slam(args: argparse.Namespace) -> int:
-    """Run the SLAM on a log, or with faults; print and write the figures."""
+    """Run the SLAM on a log; print and write the figures."""
     from instant_ic.bag.replay import make_node
     from instant_ic.experiments.plots import save_map
     from instant_ic.experiments.slam import evaluate_log
-    from instant_ic.experiments.slam_faults import FAULTS, evaluate_faults
     from instant_ic.experiments.slam_logs import is_bag, read_bag, read_log
 
     if args.stamps and not args.relations:
@@ -82,15 +76,6 @@ def evaluate_slam(args: argparse.Namespace) -> int:
         relations = _relations(args)
         entries = list(read_bag(args.log, args.scan_topic) if is_bag(args.log) else read_log(args.log, bad))
         folder.mkdir(parents=True, exist_ok=True)
-        if args.faults:
-            faults = FAULTS if args.faults == "all" else tuple(args.faults.split(","))
-            report = evaluate_faults(
-                entries, config, places=args.places, seed=args.seed, faults=faults,
-                on_step=lambda name: advance(0.0, name),
-            )  # fmt: skip
-            report = {"log": args.log.name, "seed": args.seed, **report, "output": str(folder)}
-            print_figures(report, folder / "faults.json", args.json)
-            return 0
         report, run = evaluate_log(
             entries, relations, config, use_wheel_odom=not args.no_odometry,
             on_scan=lambda done: advance(done / len(entries)),
