@@ -120,8 +120,6 @@ class RecordingDesk:
             "path": recording.get("path", ""),
             "seconds": recording.get("seconds", 0.0),
             "bytes": recording.get("bytes", 0),
-            "free_bytes": recording.get("free_bytes"),
-            "cached_s": status.get("cached_s", 0.0),
         }
 
 

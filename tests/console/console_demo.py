@@ -59,9 +59,8 @@ class DemoRecorder:
         recording = {"state": self.state, "path": path, "seconds": round(seconds, 1), "bytes": int(2e6 * seconds)}
         return {
             "path": path,
-            "cached_s": 60.0,
             "snapshots": self.snapshots,
-            "recording": recording | {"error": self.error, "free_bytes": 50_000_000_000},
+            "recording": recording | {"error": self.error},
         }
 
 

@@ -166,11 +166,6 @@ function setScale(percent) {
   drive.setScale(value / 100);
 }
 
-function fullScreen() {
-  if (document.fullscreenElement) document.exitFullscreen();
-  else document.documentElement.requestFullscreen().catch((error) => hud.toast(`Full screen failed: ${error.message}`));
-}
-
 function help() {
   if (helpDialog.open) helpDialog.close();
   else helpDialog.showModal();
@@ -187,7 +182,6 @@ const SHORTCUTS = {
   KeyM: () => screen.enlargeMap(),
   KeyR: () => recording.toggle(),
   KeyB: () => recording.mark(),
-  KeyF: fullScreen,
   KeyH: help,
   KeyV: glide,
   Minus: slower, NumpadSubtract: slower,
@@ -205,8 +199,6 @@ const CLICKS = {
   yield: () => lease.handOver(),
   "map-size": SHORTCUTS.KeyM,
   "map-canvas": SHORTCUTS.KeyM,
-  fullscreen: fullScreen,
-  "fullscreen-more": fullScreen,
   "help-open": help,
   "help-more": help,
 };

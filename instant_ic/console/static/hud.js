@@ -8,7 +8,6 @@
 /** @import { Health, State } from "./messages.js" */
 import { byId, mark, write } from "./dom.js";
 import { degrees } from "./math.js";
-import { PANORAMA, VIEW } from "./messages.js";
 import * as texts from "./texts.js";
 
 const ANNOUNCE_MS = 400;
@@ -37,8 +36,6 @@ export function showLatency(link, images) {
   put("image-ms", images.ageMs(), ms, 400, 1000);
   put("camera-ms", images.blend < 1 ? images.cameraMs : null, ms, 400, 1000);
   put("command-ms", link.commandAgeMs, ms, 80, 200);
-  const camera = images.rate(PANORAMA), view = images.rate(VIEW);
-  write(byId("rates"), camera || view ? `${camera.toFixed(0)} · ${view.toFixed(0)} /s` : "–");
 }
 
 /** @param {Health} health */

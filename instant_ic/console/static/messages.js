@@ -114,8 +114,6 @@ const recording = object({
   path: optional(text),
   seconds: optional(number),
   bytes: optional(number),
-  free_bytes: optional(number),
-  cached_s: optional(number),
   notice: object({ number, text, level: text }),
 });
 const refused = object({

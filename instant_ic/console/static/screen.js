@@ -11,7 +11,6 @@
 /** @import { Vec3 } from "./math.js" */
 /** @import { GlViewer } from "./viewer.js" */
 import { byId, elementOf, mark } from "./dom.js";
-import { FrameRate } from "./framerate.js";
 import { drawGuide } from "./guide.js";
 import { showLatency } from "./hud.js";
 import { shows } from "./images.js";
@@ -46,7 +45,6 @@ export class Screen {
     /** @type {Settings} */
     this.settings = DEFAULTS;
     this._guide = elementOf("guide", HTMLCanvasElement);
-    this._rate = new FrameRate();
     this._frameAt = this._viewAt = this._steppedAt = performance.now();
     this._requested = this._wanted = false;
     this._timer = 0;
@@ -130,14 +128,11 @@ export class Screen {
     const scene = this.images.scene(this.state, this.look, tanHalf, elapsed);
     const moved = this._renderView(scene);
     this._reportShown();
-    this._rate.frame(now, moved);
     this._drawOverlay(scene, tanHalf);
     this._drawMap(tanHalf, now);
     if (now - this._latencyAt > LATENCY_MS) {
       this._latencyAt = now;
       showLatency(this.link, this.images);
-      this.images.framesPerSecond = this._rate.perSecond;
-      mark("fps", this._rate.perSecond.toFixed(1));
       mark("image", this.images.shown ? (this.images.stale ? "stale" : "live") : "none");
     }
     // For tests and debugging.
