@@ -3,7 +3,7 @@
 from dataclasses import dataclass, field
 from typing import Annotated, Literal
 
-from instant_ic.config.ranges import Checked, NotNegativeInt, Percent, Plausible, PositiveInt, check_ranges
+from instant_ic.config.ranges import Checked, NotNegativeInt, Plausible, PositiveInt, check_ranges
 from instant_ic.config.robot import CAMERA_MOUNT, Mount
 from instant_ic.util.safe_text import holds_password
 
@@ -55,14 +55,12 @@ class VideoConfig(Checked):
     Attributes:
         latency_s: time from the exposure to the arrival of an image (about 0.25 s over USB).
         read_timeout_s: time without data after which the stream is closed.
-        quality: quality of the encoded JPEGs, 1-100.
         width: width requested from a device, pixels; 0 keeps the device's setting.
         height: height requested from a device, pixels; 0 keeps the device's setting.
     """
 
     latency_s: Annotated[float, Plausible(0, 2)] = 0.25
     read_timeout_s: Annotated[float, Plausible(0.1, 60)] = 2.0
-    quality: Percent = 90
     width: NotNegativeInt = 0
     height: NotNegativeInt = 0
 
@@ -74,12 +72,10 @@ class FilesConfig(Checked):
     Attributes:
         rate_hz: images per second.
         loop: start again after the last image; otherwise the last image is repeated.
-        quality: JPEG quality for files in other formats, 1-100.
     """
 
     rate_hz: Annotated[float, Plausible(0.01, 200)] = 5.0
     loop: bool = True
-    quality: Percent = 90
 
 
 @dataclass(frozen=True)

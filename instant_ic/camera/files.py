@@ -5,7 +5,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from instant_ic.camera.config import FilesConfig
-from instant_ic.camera.source import Camera, CameraError, Frame
+from instant_ic.camera.source import JPEG_QUALITY, Camera, CameraError, Frame
 from instant_ic.util.jpeg import JpegError, check_whole, jpeg_size
 from instant_ic.util.limits import load_image
 
@@ -100,4 +100,4 @@ class FileCamera(Camera):
         image = load_image(path, cv2.IMREAD_COLOR)
         if image is None:
             raise JpegError("cannot be decoded as an image")
-        return bytes(cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, self.config.quality])[1].tobytes())
+        return bytes(cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])[1].tobytes())

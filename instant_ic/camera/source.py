@@ -9,6 +9,9 @@ from typing import Self
 
 from instant_ic.util.closing import Closing
 
+JPEG_QUALITY = 90
+"""Quality of images that do not come as JPEG, 1 to 100."""
+
 
 class CameraError(ConnectionError):
     """The camera delivers no images; the text says why and what to do. Reconnecting may help."""

@@ -11,7 +11,7 @@ from typing import Any
 from urllib.parse import quote
 
 from instant_ic.camera.config import VideoConfig
-from instant_ic.camera.source import Camera, CameraError, Frame
+from instant_ic.camera.source import JPEG_QUALITY, Camera, CameraError, Frame
 from instant_ic.util.pace import current
 
 _OPEN_S = 10.0
@@ -78,7 +78,7 @@ class VideoCamera(Camera):
         if not ok:
             self.close()
             raise CameraError(f"{self.url}: no more frames: the stream ended or the device was disconnected")
-        encoded, jpeg = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, self.config.quality])
+        encoded, jpeg = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
         if not encoded:
             raise CameraError(f"{self.url}: a frame {image.shape} {image.dtype} cannot be encoded as JPEG")
         return Frame(jpeg.tobytes(), stamp_ns, int(image.shape[1]), int(image.shape[0]))

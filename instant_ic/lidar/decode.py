@@ -190,17 +190,7 @@ def _column_times(steps, columns, count, limit, per_us, sent_us, column_us):  # 
 
 @njit(nogil=True, cache=True, boundscheck=False)
 def _decode(packets, time_us, first_block, end_block, pair, limits, points, firings):  # type: ignore[no-untyped-def]
-    """Decode packets (kernel of `decode_packets`).
-
-    Args:
-        packets: as in `decode_packets`.
-        time_us: as in `decode_packets`.
-        first_block: as in `decode_packets`.
-        end_block: as in `decode_packets`.
-        pair: blocks of one azimuth: 2 in dual return mode, else 1.
-        limits: smallest and largest range, 2 mm.
-        points: output, `POINT_DTYPE`.
-        firings: output: azimuth (rad), time (s) and too-close flag of each firing sequence.
+    """Decode packets (kernel of `decode_packets`, whose arrays it takes); ``pair`` is 2 in dual return mode, else 1.
 
     Returns:
         Number of points, number of firing sequences, start and end time in microseconds.
@@ -241,17 +231,8 @@ def _decode_block(  # type: ignore[no-untyped-def]
 ):
     """Decode a block, or a pair of dual returns; return the new number of points.
 
-    Args:
-        packet: payload, (1206,).
-        block: number of the block.
-        pair: as in `_decode`.
-        per_us: turn rate, 0.01 degrees per microsecond.
-        block_us: time of the block's first ray after the revolution's first firing.
-        limits: as in `_decode`.
-        points: as in `_decode`.
-        n_points: number of points so far.
-        firings: as in `_decode`.
-        n_firings: number of firing sequences so far.
+    ``per_us`` is the turn rate in 0.01 degrees per microsecond, ``block_us`` the time of the block's first ray after
+    the revolution's first firing. ``limits`` are the smallest and the largest range in units of 2 mm.
     """
     firing_azimuth, firing_time, firing_too_close = firings
     at = 100 * block
@@ -280,16 +261,7 @@ def _decode_ray(  # type: ignore[no-untyped-def]
 ):
     """Decode the one or two returns of a ray; return the new number of points, and whether a return was too close.
 
-    Args:
-        packet: payload, (1206,).
-        offset: first byte of the ray's first return; the second follows a block later.
-        laser: laser id.
-        pair: number of returns.
-        azimuth: azimuth of the ray, 0.01 degrees.
-        time_us: time of the ray after the revolution's first firing.
-        limits: as in `_decode`.
-        points: as in `_decode`.
-        n_points: number of points so far.
+    ``offset`` is the first byte of the first return; the second one follows a block later.
     """
     min_units, max_units = limits
     index = int(azimuth + np.float32(0.5) + np.float32(36000.0)) % 36000
