@@ -61,15 +61,6 @@ def log_ratios(depth: Floats, range_m: Floats) -> NDArray[np.float64]:
     return np.log(_positive(ratios, "pairs of range and depth"))
 
 
-def median_ratio_scale(depth: Floats, range_m: Floats) -> float:
-    """Median of range over depth, pairs of the same direction, both (N,).
-
-    Raises:
-        ScaleError: fewer than ``MIN_VALUES`` usable pairs.
-    """
-    return float(np.exp(np.median(log_ratios(depth, range_m))))
-
-
 def consensus_scale(depth: Floats, range_m: Floats, tolerance: float = 0.15) -> Consensus:
     """Scale that most pairs agree on within a factor 1 + ``tolerance``: RANSAC with every hypothesis, by sorting.
 

@@ -15,14 +15,13 @@ from instant_ic.depth.scale_rules import (
     ScaleError,
     consensus_scale,
     max_ratio_scale,
-    median_ratio_scale,
     ransac_line,
     sector_factors,
     solid_angle_quantile,
 )
 from instant_ic.depth.visibility import azimuth_problem, hidden, nearest_points, on_depth_edge
 
-METHODS = ("max_ratio", "median_ratio", "ransac", "sector", "as_estimated")
+METHODS = ("max_ratio", "ransac", "sector", "as_estimated")
 MAXIMA = ("lidar", "image")
 OUTPUT_KINDS = ("metric", "scale_invariant", "relative", "disparity")
 """``metric``: metres. ``scale_invariant``: metres up to one factor. ``relative``: metres up to factor and shift.
@@ -39,7 +38,7 @@ class ScalerConfig:
     """How depth is scaled.
 
     Attributes:
-        method: sector, ransac, median_ratio, max_ratio (the paper's), as_estimated (not for driving).
+        method: sector, ransac, max_ratio (the paper's), as_estimated (not for driving).
         maxima: max_ratio's largest depth: over the LiDAR's directions (lidar) or the whole image (image).
         output_kind: kind of the model's output, as in its manifest: metric, scale_invariant, relative, disparity.
         min_range_m: metres from the camera; nearer points (the robot itself) are left out.
@@ -196,8 +195,6 @@ class DepthScaler:
             return ransac_line(at_points, range_m, AGREEMENT * range_m)[:2]
         if config.output_kind == "disparity":
             return ransac_line(at_points, 1.0 / range_m, AGREEMENT / range_m)[:2]
-        if config.method == "median_ratio":
-            return median_ratio_scale(at_points, range_m), 0.0
         if config.method in ("ransac", "sector"):
             return consensus_scale(at_points, range_m, AGREEMENT).scale, 0.0
         if config.maxima == "lidar":

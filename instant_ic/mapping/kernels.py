@@ -153,7 +153,7 @@ def _add_ends(key, odds, sums, last, sight, points, origin, cell, low, body, now
 def add_revolution(key, odds, sums, last, sight, points, origin, cell, low, body, now, keep, first, stride, reach):  # type: ignore[no-untyped-def]
     """Free the voxels that beams passed, then add their ends. All in metres and in the model's frame.
 
-    Arrays and parameters:
+    Args:
         key, odds, sums, last, sight: state of the model.
         points: ends of the beams, (M, 3); origin: start of the beams, (3,).
         cell: side of a voxel; low: height of the lowest voxels.
@@ -224,7 +224,7 @@ def _index_columns(odds, sums, last, now, keep, ground, top, index):  # type: ig
 def _measured_voxels(odds, code, tops, ground, top):  # type: ignore[no-untyped-def]
     """Write the solid voxels of a column as far as they follow from its own measurements.
 
-    Arrays and parameters:
+    Args:
         odds: log odds of the column, (L,); code: out, (L,); ground, top: as in ``solid_columns``.
         tops: out, (3,): one past the highest measured level, first free level above, and one past the highest level
             that beams met again and again.
@@ -276,7 +276,7 @@ def _continue_upwards(key, odds, sight, index, a, b, tops, highest, low, cell, g
 def solid_columns(key, odds, sums, last, sight, now, keep, cell, low, ground, top, index):  # type: ignore[no-untyped-def]
     """Find the solid voxels of every column with points, and its surface.
 
-    Arrays and parameters:
+    Args:
         key, odds, sums, last, sight: state of the model; now, keep, cell, low: as in ``add_revolution``.
         ground, top: lowest level and one past the highest between floor and ceiling.
         index: out, (N, N) int32: row of each column in the results, ``OPEN`` without a solid voxel.
@@ -491,7 +491,7 @@ def put_plates(key, odds, index, codes, faces, origin, cell, ground, behind, hig
 def _meet_column(code, face, origin, dx, dy, dz, flat, t, leave, cell, low, pending):  # type: ignore[no-untyped-def]
     """Return where and on what a ray meets a column between ``t`` and ``leave``; ``pending`` if nothing is nearer.
 
-    Arrays and parameters:
+    Args:
         code, face: codes and surface of the column, (L,) and (6,); origin: start of the ray, (3,).
         dx, dy, dz, flat: direction of the ray, and the length of its horizontal part.
         pending: length and kind of the surface met before.
@@ -531,7 +531,7 @@ def _meet_column(code, face, origin, dx, dy, dz, flat, t, leave, cell, low, pend
 def _cast(key, index, codes, faces, origin, ray, cell, low, limit, reach, unseen):  # type: ignore[no-untyped-def]
     """Return length and kind of the first surface on a ray, how far it came, and its way through unseen columns.
 
-    Arrays and parameters:
+    Args:
         ray: unit direction, (3,); limit: length at which it meets floor or ceiling.
         key, index, codes, faces, origin, cell, low, reach, unseen: as in ``cast_rays``.
     """
@@ -590,7 +590,7 @@ def cast_rays(  # type: ignore[no-untyped-def]
 ):
     """Find the first surface on every ray.
 
-    Arrays and parameters:
+    Args:
         key: state of the model; index, codes, faces: results of ``solid_columns``.
         origin: start of the rays, (3,); rays: unit directions in the model's frame, (M, 3).
         cell, low: as in ``add_revolution``.

@@ -12,7 +12,7 @@ from instant_ic.vspace.config import (
 from instant_ic.vspace.mesh_space import MeshSpace, Space, make_space
 from instant_ic.vspace.prior import KeyframeError
 from instant_ic.vspace.saved import SpaceFileError
-from instant_ic.vspace.space import NotReadyError, SpaceState, SpaceStatus, TrainStats, VirtualSpace
+from instant_ic.vspace.space import NotReadyError, SpaceState, SpaceStatus, VirtualSpace
 from instant_ic.vspace.view import View
 from instant_ic.vspace.warp import PanoramaWarp
 
@@ -31,7 +31,6 @@ __all__ = [
     "SpaceState",
     "SpaceStatus",
     "TrainConfig",
-    "TrainStats",
     "View",
     "VirtualSpace",
     "VirtualSpaceConfig",

@@ -51,7 +51,7 @@ def opinion(x, y, z, inverse, sure, room):  # type: ignore[no-untyped-def]
 def outvoted(directions, inverse, sure, map_from_camera, camera_from_map, room, own, step, out):  # type: ignore[no-untyped-def]
     """Pixels of keyframe ``own`` through which most of the keyframes with an opinion have looked.
 
-    Arrays and parameters:
+    Args:
         directions: unit vectors of the panorama's pixels in the camera's frame, (h, w, 3).
         inverse, sure: inverse depth and known pixels of all keyframes, newest first, (K, h, w).
         map_from_camera, camera_from_map: poses and their inverses, (K, 4, 4).

@@ -22,7 +22,7 @@ def in_front(inverse, depth_edge, level, reach, steps):  # type: ignore[no-untyp
     From the near side of each edge the near surface is followed, as long as it stays nearer than half way between the
     two sides of that edge.
 
-    Arrays and parameters:
+    Args:
         inverse, depth_edge: arrays of the ``PanoramaPrior``, (h, w).
         level: (h, w) over 0 on the floor and the ceiling, which hide nothing.
         reach: pixels at most.
@@ -69,7 +69,7 @@ def draw_quads(  # type: ignore[no-untyped-def]
 ):
     """Render some quads of a panorama's mesh into a z-buffer.
 
-    Arrays and parameters:
+    Args:
         quads: upper left pixels (row, column), (N, 2); mark: what ``marks`` gets.
         inverse: (h, w); directions: of the pixels, (h, w, 3).
         view_from_camera, half, nearness, marks: as in ``warp_kernels.draw_mesh``.

@@ -14,7 +14,7 @@ from instant_ic.vspace.nerf.kernels import _OPTIONS
 def farthest_walls(upright, wall, share, far):  # type: ignore[no-untyped-def]
     """Distance of the farthest walls around a keyframe, by direction.
 
-    Arrays and parameters:
+    Args:
         upright: inverse of the horizontal distance, (h, w); wall: (h, w) where that is of anything upright.
         share: quantile of a column that counts, from the far end.
         far: out, (w,) inverse distance, 0 where no wall is seen.
@@ -39,7 +39,7 @@ def walls_behind(  # type: ignore[no-untyped-def]
     What is seen above a near surface goes on behind it. Where nothing behind it is seen above it, the planes of the
     walls at its left and right go on; two of them meet in a corner.
 
-    Arrays and parameters:
+    Args:
         upright, wall: as in ``farthest_walls``; hole: near surfaces, (h, w).
         far: result of ``farthest_walls``.
         look, span: rows above a near surface, and columns beside it, that a wall is fitted to.
@@ -126,7 +126,7 @@ def _plane_beside(upright, far, u, row, hidden, side, span, same, behind, slope_
 def wall_colours(rgb, source, upright, far, same, colours):  # type: ignore[no-untyped-def]
     """Write the common colour of the farthest wall in each column, (w, 3) float32; −1 where it is not seen.
 
-    Arrays and parameters:
+    Args:
         rgb: (h, w, 3); source: (h, w) pixels of walls; upright, far, same: as in ``walls_behind``.
     """
     height, width = source.shape
@@ -146,7 +146,7 @@ def wall_colours(rgb, source, upright, far, same, colours):  # type: ignore[no-u
 def _colour_above(rgb, source, upright, found, v, u, same, some, total):  # type: ignore[no-untyped-def]
     """Write the median colour of what is seen of the wall above a pixel; return False if nothing is.
 
-    Arrays and parameters:
+    Args:
         rgb, source, upright, found, same: as in ``continue_walls``; v, u: the pixel.
         some: scratch, (most, 3); total: out, (3,).
     """
@@ -170,7 +170,7 @@ def _colour_beside(  # type: ignore[no-untyped-def]
 ):
     """Add the colour of the wall at one side of a pixel to ``total`` (3,).
 
-    Arrays and parameters:
+    Args:
         side: −1 left, 1 right; v, u: the pixel; some: scratch, (most, 3).
         rgb, source, slope, upright, far, found, column_colour, same, fade, reach: as in ``continue_walls``.
 
@@ -218,7 +218,7 @@ def continue_walls(  # type: ignore[no-untyped-def]
     The colour of what is seen of the wall above counts first, else those of both sides: near them as they are at the
     same height, farther on in the wall's common colour.
 
-    Arrays and parameters:
+    Args:
         rgb: panorama, (h, w, 3); source: pixels of walls, (h, w).
         hole: pixels to fill, (h, w); coverage: share of the wall in each of them; those above 0 are coloured, (h, w).
         slope: tangent of each pixel's elevation, (h, w); upright, far, found, same: as in ``walls_behind``.
@@ -253,7 +253,7 @@ def continue_walls(  # type: ignore[no-untyped-def]
 def continue_level(rgb, source, hole, coverage, reach, most, colour):  # type: ignore[no-untyped-def]
     """Continue the floor or the ceiling into holes from both sides along rows: a row lies at one distance.
 
-    Arrays and parameters:
+    Args:
         rgb, source, hole, coverage, reach, colour: as in ``continue_walls``.
         most: pixels of a side that a colour is the median of, fewer close by.
     """

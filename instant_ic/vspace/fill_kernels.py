@@ -85,7 +85,7 @@ def cut_tops(inverse, sigma, rgb, room, reach, step, assumed, contrast, share): 
     A top is assumed where its depth is less sure than that of the thing below it. Its rows, from above, belong to what
     is seen above it as long as their colour does.
 
-    Arrays and parameters:
+    Args:
         inverse, sigma: inverse depth and its relative standard deviation, (h, w) float32; in and out.
         rgb: (h, w, 3) float32; room: (h, w) where pixels show surfaces.
         reach: rows of a top, at most; step: a thing is nearer than what is above it by this factor.

@@ -188,7 +188,11 @@ class SpaceWorker:
         if job.kind is JobKind.TRAIN:
             space.train(job.budget_ms, job.iterations)
         elif keyframe is not None and job.kind is JobKind.KEYFRAME:
-            space.take_keyframe(*keyframe.decode())
+            arrays = keyframe.decode()
+            if isinstance(space, VirtualSpace):
+                space.show(space.prepare(*arrays), dissolve=True)
+            else:
+                space.set_keyframe(*arrays)
         elif keyframe is not None and isinstance(space, VirtualSpace) and space.shown is not None:
             if job.kind is JobKind.LEARN:
                 space.learn(space.shown)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +13,7 @@ from instant_ic.vspace.agreement import exposure_gains, moved
 from instant_ic.vspace.background import Background
 from instant_ic.vspace.nerf.field import Floats
 from instant_ic.vspace.prior import PanoramaPrior
+from instant_ic.vspace.readiness import Texture
 from instant_ic.vspace.warp import PanoramaWarp, Pyramid
 
 REACH_M = 3.0
@@ -39,6 +41,11 @@ class Keyframe:
             pyramid: image pyramid of its panorama; built here if None.
         """
         return cls(prior, PanoramaWarp(prior, pyramid), Background.of(prior))
+
+    @cached_property
+    def texture(self) -> Texture:
+        """Texture of the panorama."""
+        return Texture.of(self.prior.rgb)
 
     @property
     def position(self) -> NDArray[np.float64]:

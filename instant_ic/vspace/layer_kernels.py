@@ -57,7 +57,7 @@ def lattice_errors(corners, directions, alone, tile):  # type: ignore[no-untyped
     split first, then the middles of the sides, then the centres of its quarters. So the error of a corner is at least
     that of the corners split after it.
 
-    Arrays and parameters:
+    Args:
         corners: inverse depth (h + 1, w); directions: (h + 1, w, 3).
         alone: (h, w) pixels that are squares of their own: their corners are never left out.
         tile: side of the largest squares, in pixels, a power of two.

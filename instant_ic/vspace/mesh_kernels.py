@@ -32,7 +32,7 @@ def shade(  # type: ignore[no-untyped-def]
 ):  # fmt: skip
     """Colours where rays meet the mesh: texture (trilinear, by the pixel's footprint) or vertex colours.
 
-    Arrays and parameters:
+    Args:
         triangles ... levels: of the ``ScannedMesh``.
         origin: (3,); directions: (P, 3); range_m, face: (P,), what each ray meets, face −1 for nothing.
         pixel_rad: angle of a pixel.

@@ -21,8 +21,8 @@ from instant_ic.vspace.nerf.field import Floats, Rays
 from instant_ic.vspace.prior import KeyframeError, area_average
 from instant_ic.vspace.readiness import UNSEEN_GAIN, Texture
 from instant_ic.vspace.scanned_mesh import load_mesh
-from instant_ic.vspace.space import SpaceState, SpaceStatus, TrainStats, VirtualSpace
-from instant_ic.vspace.view import RayRenderer, View, checked_pose, continue_unseen, equirect_rays, perspective_rays
+from instant_ic.vspace.space import SpaceState, SpaceStatus, VirtualSpace
+from instant_ic.vspace.view import RayRenderer, View, checked_pose, continue_unseen, equirect_rays
 
 EDGE_RATIO = 0.03
 """Neighbouring depths that differ by more than this share are an edge; its pixels are rendered by four rays."""
@@ -111,8 +111,6 @@ class MeshSpace(RayRenderer):
         aside = np.abs(rays.directions @ pose[:3, 2].astype(np.float32)) < _ASIDE
         self._check_place(depth_m, range_m, aside, width)
 
-    take_keyframe = set_keyframe
-
     def _fit_colours(self, theirs: Floats, ours: Floats) -> None:
         """Factors of the mesh's colours from medians, as between keyframes; later keyframes go half the way."""
         usable = np.all((theirs > 0.05) & (theirs < 0.95) & (ours > 0.05) & (ours < 0.95), axis=1)
@@ -138,9 +136,8 @@ class MeshSpace(RayRenderer):
                     " is space.mesh_pose right?"
                 )
 
-    def train(self, budget_ms: float = math.inf, iterations: int | None = None) -> TrainStats:
-        """There is nothing to train."""
-        return TrainStats(0, self._psnr_db, 0.0, True)
+    def train(self, budget_ms: float = math.inf, iterations: int | None = None) -> None:
+        """Do nothing: there is nothing to train."""
 
     @property
     def _psnr_db(self) -> float:
@@ -164,13 +161,6 @@ class MeshSpace(RayRenderer):
             device="cpu (embree)",
             warning=self._warning,
         )
-
-    def expected_psnr_db(self, map_from_camera: NDArray[np.floating], fov_rad: float = math.pi / 2) -> float:
-        """Return the expected PSNR of a view: the mesh's at the newest keyframe, less for parts beyond the mesh.
-
-        NaN before the first keyframe: nothing is known of how alike mesh and place are.
-        """
-        return self._view(perspective_rays(checked_pose(map_from_camera), 64, 36, fov_rad), "").expected_psnr_db
 
     def _view(self, rays: Rays, projection: str) -> View:
         height, width = rays.shape

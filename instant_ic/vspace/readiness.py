@@ -80,19 +80,6 @@ def error_terms(
     return (1 - unseen) * float(texture.cost(shift).mean()), unseen * texture.variance
 
 
-class QualityJudge:
-    """Computes ``error_terms`` of views; keeps the texture of the newest keyframe."""
-
-    def __init__(self) -> None:
-        self._texture: tuple[PanoramaPrior, Texture] | None = None
-
-    def terms(self, prior: PanoramaPrior, rays: Rays, depth: Floats, confidence: Floats) -> tuple[float, float]:
-        """Return ``error_terms`` of a view."""
-        if self._texture is None or self._texture[0] is not prior:
-            self._texture = prior, Texture.of(prior.rgb)
-        return error_terms(prior, self._texture[1], rays, depth, confidence)
-
-
 def expected_psnr_db(terms: tuple[float, float], training_psnr_db: float, panorama_share: float) -> float:
     """PSNR on the page from ``error_terms``; parts rendered by the field have at least its training error."""
     shift, unseen = terms

@@ -35,14 +35,9 @@ class Turns:
         self._rendered_last = False
         self._render_ms = 0.0
 
-    def renders_next(self, requested: bool, works: bool) -> bool:
-        """Return whether a view is next: each view is followed by a turn of other work, if there is any.
-
-        Args:
-            requested: a view is requested.
-            works: the space has to train or to take a keyframe.
-        """
-        return requested and not (works and self._rendered_last)
+    def renders_next(self, works: bool) -> bool:
+        """Return whether a requested view is next: after each view comes other work, if there is any (``works``)."""
+        return not (works and self._rendered_last)
 
     def rendered(self, render_ms: float) -> None:
         """Note the rendering time of a view."""
@@ -109,7 +104,7 @@ class JobSchedule:
             return
         trains = self._trains and not self._lockstep
         works = trains or bool(self._todo) or self._waiting_keyframe is not None
-        if self._waiting_view is not None and self.turns.renders_next(True, works):
+        if self._waiting_view is not None and self.turns.renders_next(works):
             order, self._waiting_view = self._waiting_view, None
             self._start(Job(JobKind.RENDER, view=order))
         elif self._todo:

@@ -22,12 +22,12 @@ from instant_ic.vspace.keyframes import Keyframe, KeyframeSet, extended
 from instant_ic.vspace.nerf.field import FieldParameters, Lattice, Rays, Schedule, TrainingScene
 from instant_ic.vspace.nerf.occupancy import build_occupancy
 from instant_ic.vspace.prior import PanoramaPrior, prepare
-from instant_ic.vspace.readiness import QualityJudge, expected_psnr_db
+from instant_ic.vspace.readiness import error_terms, expected_psnr_db
 from instant_ic.vspace.saved import SavedSpace, TrainingProgress, read, write
-from instant_ic.vspace.view import RayRenderer, View, checked_pose, perspective_rays
+from instant_ic.vspace.view import RayRenderer, View
 
-PROBE = (64, 36)
-"""Width and height in pixels of the view by which the quality is estimated."""
+PROBE_COLUMNS = 64
+"""Columns of the pixels of a view by which its quality is estimated."""
 PARALLAX_RAD = 0.035
 """Displacement of surfaces by the depth's error up to which views are fit to show."""
 LEAST_DEPTH_SHARE = 0.5
@@ -41,23 +41,6 @@ class SpaceState(enum.IntEnum):
     TRAINING = 1
     READY = 2
     FAILED = 3
-
-
-@dataclass(frozen=True)
-class TrainStats:
-    """Result of one ``train`` call.
-
-    Attributes:
-        iterations: iterations of this call.
-        psnr_db: running mean over the training rays since the newest keyframe; NaN before the first iteration.
-        elapsed_ms: wall time of this call.
-        converged: nothing is left to train.
-    """
-
-    iterations: int
-    psnr_db: float
-    elapsed_ms: float
-    converged: bool
 
 
 @dataclass(frozen=True)
@@ -157,7 +140,7 @@ class VirtualSpace(RayRenderer):
     Example:
         >>> space = VirtualSpace(VirtualSpaceConfig())                        # doctest: +SKIP
         >>> space.set_keyframe(rgb, depth_m, map_from_camera, relative_sigma=0.05)
-        >>> space.train(iterations=200).psnr_db
+        >>> space.train(iterations=200)
         >>> space.render(map_from_camera, 320, 180, fov_rad=1.57).rgb
     """
 
@@ -186,7 +169,6 @@ class VirtualSpace(RayRenderer):
         self.scene: TrainingScene | None = None
         self.trials: tuple[WarpTrial, ...] = ()
         self.choice = Choice(self.config.picture.field_gain_db)
-        self._judge = QualityJudge()
         self._ready = False
         self._rng = np.random.default_rng(self.config.train.seed)
         self._run = TrainingRun(self.config, refresh=False)
@@ -234,22 +216,6 @@ class VirtualSpace(RayRenderer):
         if self.config.source == "field":
             self.learn(prepared)
         self.show(prepared)
-
-    def take_keyframe(
-        self,
-        rgb: NDArray[np.uint8],
-        depth_m: NDArray[np.floating],
-        map_from_camera: NDArray[np.floating],
-        relative_sigma: float | NDArray[np.floating],
-    ) -> None:
-        """Show a new keyframe, into which views dissolve; ``learn`` may follow.
-
-        Args: as ``prior.prepare``.
-
-        Raises:
-            KeyframeError: the keyframe cannot be used; the old space stays as it was.
-        """
-        self.show(self.prepare(rgb, depth_m, map_from_camera, relative_sigma), dissolve=True)
 
     def prepare(
         self,
@@ -318,7 +284,7 @@ class VirtualSpace(RayRenderer):
         self._run = TrainingRun(self.config, refresh, self._run.colour_error if refresh else math.nan)
         self.choice.gain_db = math.nan  # on other images
 
-    def train(self, budget_ms: float = math.inf, iterations: int | None = None) -> TrainStats:
+    def train(self, budget_ms: float = math.inf, iterations: int | None = None) -> None:
         """Train for a time, a number of iterations or to the end of the schedule; at least one iteration.
 
         Raises:
@@ -341,9 +307,7 @@ class VirtualSpace(RayRenderer):
             self._ready = run.note(colour, self._done) or self._ready
             if (time.perf_counter() - start) * 1e3 >= budget_ms:
                 break
-        elapsed = time.perf_counter() - start
-        run.seconds += elapsed
-        return TrainStats(done, run.psnr_db, elapsed * 1e3, self._done)
+        run.seconds += time.perf_counter() - start
 
     def _choose(self) -> None:
         """Show the field or the warp, whichever renders the older keyframes better."""
@@ -384,27 +348,15 @@ class VirtualSpace(RayRenderer):
         sigma = max(prior.relative_sigma, 1e-3)
         return min(self.config.readiness.max_radius_m, PARALLAX_RAD * prior.median_depth_m / sigma)
 
-    def expected_psnr_db(self, map_from_camera: NDArray[np.floating], fov_rad: float = math.pi / 2) -> float:
-        """Estimate the PSNR of a view without ground truth (``readiness``); −inf without a keyframe.
-
-        From the depth's error, the distance to the keyframes, what they have not seen, and the error in training.
-        """
-        shown = self._shown
-        if shown is None:
-            return -math.inf
-        rays = perspective_rays(checked_pose(map_from_camera), *PROBE, fov_rad)
-        self._learn_what_is_rendered(around=False)
-        view = self._composed(rays, shown, around=False)
-        return self._expected(rays, view)
-
     def _expected(self, rays: Rays, view: ComposedView) -> float:
         """Return the expected PSNR of a view as it was rendered, from a few thousand of its pixels."""
-        assert self.keyframe is not None
-        step = max(1, rays.shape[1] // PROBE[0])
+        assert self._shown is not None
+        step = max(1, rays.shape[1] // PROBE_COLUMNS)
         height, width = rays.shape
         chosen = np.arange(step // 2, height, step)[:, None] * width + np.arange(step // 2, width, step)
         chosen = chosen.reshape(-1)
-        terms = self._judge.terms(self.keyframe, rays.some(chosen), view.depth[chosen], view.confidence[chosen])
+        newest, seen = self._shown.newest, (view.depth[chosen], view.confidence[chosen])
+        terms = error_terms(newest.prior, newest.texture, rays.some(chosen), *seen)
         return expected_psnr_db(terms, self._run.psnr_db, self._panorama_share)
 
     def _view(self, rays: Rays, projection: str) -> View:

@@ -48,11 +48,6 @@ class View:
         return float(np.count_nonzero(self.confidence == 0)) / self.confidence.size
 
     @property
-    def opacity(self) -> NDArray[np.float32]:
-        """1 where the ray meets a surface, seen or not, else 0, (H, W): surfaces are met or missed, never half."""
-        return (self.depth_m > 0).astype(np.float32)
-
-    @property
     def mean_confidence(self) -> float:
         """Mean over the image; of an equirect image by solid angle."""
         if self.projection != "equirect":

@@ -33,7 +33,7 @@ def beyond(x, y, z, half, tall):  # type: ignore[no-untyped-def]
 def place_vertices(inverse, directions, view_from_camera, half, aspect, vertices, outside):  # type: ignore[no-untyped-def]
     """Corners of the mesh in the view's frame, and the planes of the view that they lie beyond.
 
-    Arrays and parameters:
+    Args:
         inverse: inverse depth, (h, w); directions: unit vectors, (h, w, 3).
         view_from_camera: (4, 4) float32.
         half, aspect: tangent of half the horizontal field of view, and height over width of the view.
@@ -100,7 +100,7 @@ def draw_mesh(  # type: ignore[no-untyped-def]
     A quad that crosses a depth edge is rendered as four quarters, each at the depth of its own corner: nothing is
     missing from the panorama's own position, and the edge opens from the side.
 
-    Arrays and parameters:
+    Args:
         vertices, outside: of ``place_vertices``; inverse, depth_edge, known: of the ``PanoramaPrior``, with a row more
             above and below for the poles; known 2: nothing is rendered there.
         corners: unit vectors half a pixel up and left of each pixel, (h + 1, w, 3).
@@ -264,7 +264,7 @@ def look_up(texels, level_start, sizes, places, height, width, blur, wanted, sha
     The footprint follows from the places of neighbouring pixels; a stretched one gets up to ``MAX_TAPS`` samples along
     its longer side (anisotropic filtering).
 
-    Arrays and parameters:
+    Args:
         texels, level_start, sizes: arrays of the ``Pyramid``.
         places: index coordinates of ``panorama_places`` for all pixels of the view, (P, 2), P = height · width.
         height, width: size of the view.

@@ -1,7 +1,6 @@
 """Models of others: the manifests of models/examples with ONNX files of exactly those inputs and outputs."""
 
 import shutil
-import threading
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +11,7 @@ import yaml
 from onnx import helper
 from tiny_onnx import CHANNELS, channel
 
-from instant_ic.depth.manifest import InferenceError, ManifestError, load_manifest
+from instant_ic.depth.manifest import ManifestError, load_manifest
 from instant_ic.depth.model import DepthModel
 from instant_ic.depth.providers import PROVIDERS
 from instant_ic.util.paths import share_dir
@@ -103,51 +102,6 @@ def test_models_that_cannot_be_used_say_why(tmp_path: Path) -> None:
     tiny_onnx.write(path, {"image": (1, 3, 64, 128)}, {"depth": (4,)}, shape, output_kind=onnx.TensorProto.INT64)
     with pytest.raises(ManifestError, match=r"output 'depth' is \[4\]"):
         DepthModel.load(manifest_of(path))
-
-
-def endless(path: Path) -> Path:
-    """A network that multiplies its input again and again, for hours."""
-    body = helper.make_graph(
-        [helper.make_node("Identity", ["on"], ["still"]), helper.make_node("Mul", ["x", "x"], ["y"])],
-        "body",
-        [
-            helper.make_tensor_value_info("step", onnx.TensorProto.INT64, []),
-            helper.make_tensor_value_info("on", onnx.TensorProto.BOOL, []),
-            helper.make_tensor_value_info("x", tiny_onnx.FLOAT, None),
-        ],
-        [
-            helper.make_tensor_value_info("still", onnx.TensorProto.BOOL, []),
-            helper.make_tensor_value_info("y", tiny_onnx.FLOAT, None),
-        ],
-    )
-    loop = helper.make_node("Loop", ["many", "", "red"], ["depth"], body=body)
-    nodes = [*channel("image", 0, "red"), loop]
-    many = CHANNELS | {"many": [10**12]}
-    tiny_onnx.write(path, {"image": (1, 3, 64, 128)}, {"depth": (1, 1, 64, 128)}, nodes, many)
-    return manifest_of(path)
-
-
-def test_an_inference_can_be_ended(tmp_path: Path) -> None:
-    model = DepthModel.load(endless(tmp_path / "m.onnx"), threads=1)
-    failed: list[Exception] = []
-
-    def run() -> None:
-        try:
-            model.estimate(np.zeros((64, 128, 3), np.uint8))
-        except InferenceError as error:
-            failed.append(error)
-
-    thread = threading.Thread(target=run, daemon=True)
-    thread.start()
-    ended = threading.Event()
-    for _ in range(1000):  # the inference may not have begun yet: ask until it ends
-        model.cancel()
-        thread.join(0.03)
-        if not thread.is_alive():
-            ended.set()
-            break
-    assert ended.is_set()
-    assert "terminate" in str(failed[0])
 
 
 @pytest.mark.parametrize(

@@ -390,14 +390,6 @@ def test_where_a_completion_is_taken() -> None:
     assert got.prior is None and got.message.endswith("completed") and got.source == "completed"
 
 
-def test_what_the_lidar_has_measured_is_not_completed() -> None:
-    prior = with_prior().prior
-    assert prior is not None
-    rows, columns, _ = nearest_points(POINTS, SIZE[1], SIZE[0])
-    upright = rows < 50  # of points below, some are on the floor
-    assert prior.measured[rows[upright], columns[upright]].all() and not prior.measured[-1].any()
-
-
 @pytest.mark.parametrize("error", [InferenceError("out of memory"), ValueError("no panorama")])
 def test_failed_completion_leaves_the_fused_depth(error: Exception) -> None:
     def fails(channels):

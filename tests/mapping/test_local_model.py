@@ -220,16 +220,6 @@ def test_wild_points_do_no_harm(factor: float) -> None:
     assert np.isfinite(found.depth_m).all() and ((found.depth_m > 0) == np.isfinite(found.sigma)).all()
 
 
-def test_wrong_use_is_refused() -> None:
-    model = LocalModel()
-    with pytest.raises(ValueError, match=r"points must be \(N, 3\)"):
-        model.add(np.zeros((4, 2)), np.zeros(3))
-    with pytest.raises(ValueError, match="position must be finite"):
-        model.add(np.zeros((4, 3)), np.array([np.nan, 0, 0]))
-    with pytest.raises(ValueError, match="keep_m must be > 0"):
-        LocalModelConfig(keep_m=0)
-
-
 def buffer(map_from_odom: Matrix | None = None) -> TransformBuffer:
     """Robot that stands until second 1, then drives along x at 0.5 m/s."""
     transforms = TransformBuffer()

@@ -36,7 +36,7 @@ def run_dir(monkeypatch: pytest.MonkeyPatch) -> Path:
     return folder
 
 
-def write_bag(path: Path, with_odometry: bool = True) -> None:
+def write_bag(path: Path) -> None:
     """A robot that drives 0.6 m along x towards a wall 3 m from the origin, in the map turned by 90 degrees."""
     y, z = (each.ravel() for each in np.meshgrid(np.linspace(-1, 1, 80), np.linspace(-0.5, 0.5, 40)))
     with BagWriter(path) as bag:
@@ -48,10 +48,9 @@ def write_bag(path: Path, with_odometry: bool = True) -> None:
         write("/tf_static", TFMessage([transform_message(pose_matrix(0, 0, 0.6), "base_link", "velodyne", S)]), S)
         for k in range(21):
             stamp, x = S + k * S // 10, 0.03 * k
-            if with_odometry:
-                poses = [transform_message(pose_matrix(x, 0, 0), "odom", "base_link", stamp)]
-                poses.append(transform_message(pose_matrix(0, 0, 0, yaw=np.pi / 2), "map", "odom", stamp))
-                write("/tf", TFMessage(poses), stamp)
+            poses = [transform_message(pose_matrix(x, 0, 0), "odom", "base_link", stamp)]
+            poses.append(transform_message(pose_matrix(0, 0, 0, yaw=np.pi / 2), "map", "odom", stamp))
+            write("/tf", TFMessage(poses), stamp)
             cloud = np.zeros(len(y), POINT_DTYPE)
             cloud["x"], cloud["y"], cloud["z"] = 3.0 - x, y, z
             write("/lidar/points", cloud_message(cloud, "velodyne", stamp), stamp)
@@ -68,13 +67,6 @@ def test_a_bag_gives_the_model_at_its_end_in_the_map(tmp_path: Path, capsys: pyt
     assert capsys.readouterr().out.endswith(f"cloud.ply: {len(points)} points\n") and len(points) > 300
     # The wall x = 3 m of odometry lies at y = 3 m of the map.
     assert np.abs(points[:, 1] - 3.0).max() < 0.03 and points[:, 0].min() > -1.05 and points[:, 0].max() < 1.05
-
-
-def test_a_bag_without_odometry_is_refused_with_the_reason(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    write_bag(tmp_path / "still", with_odometry=False)
-    assert main(["map", "local", str(tmp_path / "still"), "-o", str(tmp_path / "cloud.ply")]) == 1
-    assert "none of 21 LiDAR revolutions can be placed: no path from velodyne to odom" in capsys.readouterr().err
-    assert not (tmp_path / "cloud.ply").exists()
 
 
 def test_the_running_stack_is_asked(run_dir: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -92,18 +92,6 @@ def test_floor_and_ceiling_are_found_and_go_on_behind_a_thing():
     assert background.rgb[28, 60:68, 2].min() > 140  # wall, blue
 
 
-def test_what_opens_behind_a_thing_is_guessed_and_marked():
-    space = space_of(keyframe())
-    view = space.render(pose_matrix(y=1.0, yaw=-0.3), 96, 64, 1.2)
-    hidden = view.confidence == 0
-    assert 0.01 < hidden.mean() < 0.3
-    assert view.unseen_share == pytest.approx(hidden.mean())
-    assert np.median(view.rgb[hidden][:, 2]) > 140  # blue, as the far side
-    assert np.median(view.rgb[hidden][:, 0]) < 60
-    away = view.depth_m[hidden]
-    assert np.median(np.abs(away - 4.0)) < 0.6  # on the sphere round the keyframe
-
-
 def test_the_guess_lies_fixed_in_the_map():
     """Two places in the map that nobody has seen have one colour in pictures from different poses."""
     background = Background.of(keyframe())

@@ -1,7 +1,6 @@
 """The virtual space as a whole, and the making of a keyframe's prior."""
 
 import dataclasses
-import math
 
 import numpy as np
 import pytest
@@ -22,8 +21,7 @@ from instant_ic.vspace import (
 from instant_ic.vspace.composition import dissolve
 from instant_ic.vspace.config import GeometryConfig
 from instant_ic.vspace.nerf.occupancy import build_occupancy, surface_points
-from instant_ic.vspace.prior import area_average, edge_quads, prepare
-from instant_ic.vspace.view import perspective_rays
+from instant_ic.vspace.prior import edge_quads, prepare
 from instant_ic.vspace.warm_up import warm_up
 from tests import box_room
 
@@ -68,34 +66,6 @@ def test_a_view_from_aside_has_the_rooms_depth(space):
     error = np.abs(view.depth_m / truth.depth_m - 1)[seen]
     assert np.median(error) < 0.005
     assert psnr_db(view.rgb[seen], truth.rgb[seen]) > 21
-
-
-def test_what_no_picture_has_seen_has_no_confidence(space):
-    # From beside the box one looks at the wall behind it, which the box hides from the keyframe: a point on the wall
-    # counts as hidden when the way to it from the keyframe's camera is shorter than the wall's distance.
-    pose = pose_matrix(x=2.0, y=-1.0, yaw=1.0)
-    width, height, fov = 160, 90, 1.5
-    view, truth = space.render(pose, width, height, fov), box_room.perspective(pose, width, height, fov)
-    rays = perspective_rays(pose, width, height, fov)
-    points = rays.origin + truth.depth_m.reshape(-1, 1) * rays.directions
-    away = points - CAMERA[:3, 3]
-    distance = np.linalg.norm(away, axis=1)
-    hidden = np.array(
-        [box_room._draw(_looking(d), np.array([[[1.0, 0, 0]]], np.float32)).depth_m[0, 0] for d in away[::37]]
-    )
-    hidden = hidden < distance[::37] - 0.1
-    confidence = view.confidence.reshape(-1)[::37]
-    assert hidden.sum() > 10
-    assert confidence[hidden].mean() < 0.2
-    assert confidence[~hidden].mean() > 0.9
-    assert np.all(view.rgb.reshape(-1, 3).std(axis=0) > 5)  # and is filled, not black
-
-
-def _looking(direction):
-    x, y, z = direction
-    pose = CAMERA.copy()
-    pose[:3, :3] = pose_matrix(yaw=math.atan2(y, x), pitch=-math.atan2(z, math.hypot(x, y)))[:3, :3]
-    return pose
 
 
 def test_readiness_by_psnr_plateau_and_radius():
@@ -150,7 +120,8 @@ def test_what_is_shown_passes_into_a_new_keyframe():
     # The field has not learnt it yet, and can at any time.
     assert len(space.scene.priors) == 1 and np.array_equal(space.scene.prior.map_from_camera, CAMERA)
     space.learn(prepared)
-    assert space.train(iterations=2).iterations == 2
+    space.train(iterations=2)
+    assert space.status.iterations == 2
     assert np.array_equal(space.scene.prior.map_from_camera, NEXT)
 
 
@@ -167,7 +138,8 @@ def test_another_scale_starts_anew():
     space = trained(30)
     picture = box_room.panorama(CAMERA, 192)
     space.set_keyframe(picture.rgb, 5 * picture.depth_m, CAMERA, 0.02)
-    assert space.train(iterations=1).psnr_db < 16
+    space.train(iterations=1)
+    assert space.status.psnr_db < 16
     cells = space.scene.lattice.cells_per_m
     assert cells[0] == pytest.approx(trained(0).scene.lattice.cells_per_m[0] / 5, rel=1e-3)
 
@@ -262,7 +234,8 @@ def test_a_gpu_that_was_asked_for_fails_aloud_and_the_next_keyframe_recovers(mon
             space.set_keyframe(picture.rgb, 5 * picture.depth_m, CAMERA, 0.02)  # would start anew
         assert np.array_equal(space.render(CAMERA, 64, 36, 1.5).rgb, before.rgb)
     refreshed(space)
-    assert space.train(iterations=3).psnr_db > 5
+    space.train(iterations=3)
+    assert space.status.psnr_db > 5
     assert space.status.state == SpaceState.TRAINING
 
 
@@ -283,15 +256,6 @@ def test_warm_up_leaves_nothing_to_compile(keyframes):
 
 
 # -- prior and occupancy -------------------------------------------------------------------------------
-
-
-def test_area_average_by_hand():
-    image = np.zeros((2, 6, 1), np.uint8)
-    image[0, :, 0] = [0, 30, 60, 90, 120, 150]
-    image[1, :, 0] = [20, 50, 80, 110, 140, 170]
-    assert area_average(image, 1, 3)[..., 0].tolist() == [[25, 85, 145]]
-    # 6 columns into 4: each takes 1.5; (0 + 0.5·30) / 1.5 = 10, (0.5·30 + 60) / 1.5 = 50, …; rows differ by 20.
-    assert area_average(image, 2, 4)[..., 0].tolist() == [[10, 50, 100, 140], [30, 70, 120, 160]]
 
 
 def test_depth_edges_are_torn_and_leaning_planes_are_not():

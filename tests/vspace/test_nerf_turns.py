@@ -17,7 +17,7 @@ def run(render_ms, asks_fps, render_fps=10.0, train_ms=50.0, seconds=20.0, train
         if now >= next_ask:
             asked_at = asked_at if asked_at is not None else now
             next_ask += 1e3 / asks_fps
-        if turns.renders_next(asked_at is not None, trains):
+        if asked_at is not None and turns.renders_next(trains):
             waited, asked_at = max(waited, now - asked_at), None
             now += render_ms
             drawn += 1

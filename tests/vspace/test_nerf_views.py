@@ -62,11 +62,10 @@ def test_what_is_not_known_is_continued_across_the_seam():
     assert np.array_equal(filled[confidence > 0], image[confidence > 0])
 
 
-def test_opacity_and_mean_confidence_by_hand():
+def test_mean_confidence_by_hand():
     depth = np.array([[0, 1], [2, 0]], np.float32)
     confidence = np.array([[1, 1], [0.5, 0]], np.float32)
     view = View(np.zeros((2, 2, 3), np.uint8), depth, confidence)
-    assert view.opacity.tolist() == [[0, 1], [1, 0]]
     assert view.mean_confidence == 0.625
     # Four rows at elevations ±67.5° and ±22.5°: weights sin(22.5°) and sin(67.5°), of which only the second row counts.
     rows = np.zeros((4, 8), np.float32)

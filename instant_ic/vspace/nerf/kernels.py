@@ -56,7 +56,7 @@ def cells_block(points, start, count, origin, scale, size, pixel, entries, weigh
 
     A level counts whole while its cells are wider than the keyframe's pixel there, not at all from half of it.
 
-    Arrays and parameters:
+    Args:
         size: entries of a level, a power of two; pixel: (BLOCK,), of ``pixel_block``.
         entries: out, (8, BLOCK) uint32; weights: out, (8, BLOCK) float32.
     """
@@ -232,7 +232,7 @@ def gradient(  # type: ignore[no-untyped-def]
 
     Loss: ``Σ colour_weight[i] · |colour_i − target_i[:3]|² + distance_weight[i] · (distance_i − target_i[3])²``.
 
-    Arrays and parameters:
+    Args:
         points: (N, 3); target: (N, 4), colour minus 0.5 and signed distance; both weights: (N,).
 
     Returns:

@@ -40,7 +40,7 @@ def prior_inverse_depth(inverse, depth_edge, u, v):  # type: ignore[no-untyped-d
 def _bilinear_colour(rgb, gain, turn, fall, target, surface, near):  # type: ignore[no-untyped-def]
     """Write a panorama's colour, in the newest's exposure and minus 0.5, to two samples.
 
-    Arrays and parameters:
+    Args:
         rgb: panorama, (H, W, 3); gain: (3,).
         turn, fall: place in it as shares of its width and height.
         target: (2 N, 4), rows ``surface`` and ``near`` are written.
@@ -68,7 +68,7 @@ def sample_rays(  # type: ignore[no-untyped-def]
 ):  # fmt: skip
     """Sample one ray in each of ``columns × rows`` strata of equal solid angle, with two samples a ray.
 
-    Arrays and parameters:
+    Args:
         uniform: (N, 3) in [0, 1): place in the stratum (azimuth, height) and in the band; N = columns · rows.
         sources: (N / 64,): the keyframe that each tile of 8 × 8 strata looks from.
         rgb, inverse, depth_edge, usable, band: arrays of the ``PanoramaPrior``s, newest first, stacked: (K, …).
@@ -286,7 +286,7 @@ def _skip_empty_cells(  # type: ignore[no-untyped-def]
 def _ends_here(n, value, cell, keyframes, share, origin, direction, state, pixel, depth, confidence):  # type: ignore[no-untyped-def]
     """Test a ray at its present sample, and move it on; return True if it ends on a surface.
 
-    Arrays and parameters:
+    Args:
         n: index of the ray; value: the field's signed distance there, in bands.
         keyframes: arrays ``inverse``, ``depth_edge``, ``known``, ``camera_from_map`` and ``band`` of ``trace``.
         state: arrays of ``trace``, by ray.
@@ -330,7 +330,7 @@ def trace(  # type: ignore[no-untyped-def]
 
     The distance is the field's and the prior's own, mixed: a young field's surfaces are rough.
 
-    Arrays and parameters:
+    Args:
         grid, low, cell: grid, lowest corner and cell size of the ``Occupancy``.
         inverse, depth_edge, known, band: arrays of the ``PanoramaPrior``s, newest first, stacked: (K, …).
         camera_from_map: (K, 4, 4) float32.
@@ -400,7 +400,7 @@ def mix_panorama(  # type: ignore[no-untyped-def]
 ):
     """Mix the panorama's colour into that of surfaces which a keyframe has seen: of the newest that has.
 
-    Arrays and parameters:
+    Args:
         rgb, inverse, depth_edge, known, band: arrays of the ``PanoramaPrior``s, newest first, stacked: (K, …).
         camera_from_map: (K, 4, 4); gains: (K, 3).
         depth, confidence: (P,), of ``trace``; nothing happens where either is 0.

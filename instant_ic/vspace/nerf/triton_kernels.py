@@ -509,7 +509,7 @@ def draw(
 
     ``reference.trace``, ``reference.query`` and ``reference.mix_panorama`` in one.
 
-    Arrays and parameters:
+    Args:
         camera: position of the newest keyframe's camera, (3,).
         eye: position of the view, (3,); turn: map_from_view rotation (3, 3); directions: rays in it, (P, 3).
         colour (P, 3), depth (P,), confidence (P,): out.

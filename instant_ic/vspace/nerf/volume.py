@@ -30,7 +30,7 @@ _RAYS = BLOCK // SAMPLES
 def band_samples(camera, surface, jitter, band, newest, newest_band, points, first, offset, span):  # type: ignore[no-untyped-def]
     """Place the samples of one ray through the band around its surface.
 
-    Arrays and parameters:
+    Args:
         camera, surface: (3,); jitter: place in the strata, 0..1; band: half width, share of the depth.
         newest: the newest keyframe's camera, (3,); newest_band: its band.
         points: out, rows ``first``… of (…, 3).
@@ -71,7 +71,7 @@ def ray_weights(raw, first, span, weight, left):  # type: ignore[no-untyped-def]
 def _ray_gradient(y, first, target, weight, w, left, offset, span, losses, each, pull, dy):  # type: ignore[no-untyped-def]
     """Write the gradient of one ray's loss by the network's outputs, and return its colour and depth errors.
 
-    Arrays and parameters:
+    Args:
         y, dy: outputs of the network and their gradient, (4, BLOCK); the ray's samples begin at ``first``.
         target: colour of the ray, (3,) and more; weight: of colour and depth, (2,).
         w, left, offset, span: weights of ``ray_weights`` and places of ``band_samples``, (SAMPLES,).
@@ -121,7 +121,7 @@ def volume_gradient(  # type: ignore[no-untyped-def]
     opacity + losses[2] · distortion`` with ``depth = (Σ w o)²``, ``opacity = (1 − Σ w)²`` and ``distortion =
     Σᵢⱼ wᵢ wⱼ |oᵢ − oⱼ| + ⅓ Σ wᵢ² · step`` (Barron et al., 2022), o in bands behind the surface.
 
-    Arrays and parameters:
+    Args:
         points, target, weight: results of ``march.sample_rays``; the first 64 of each tile's 128 rows are used.
         jitter: (N,) place of each ray's samples in their strata, 0..1.
         sources: (N / 64,) each tile's keyframe; cameras: (K, 3); band: (K,).
@@ -171,7 +171,7 @@ def volume_gradient(  # type: ignore[no-untyped-def]
 def _guided_samples(origin, direction, depth, newest, band, points, first, offset, span):  # type: ignore[no-untyped-def]
     """Place a view's samples around the depth of one ray, and return the half width of their band.
 
-    Arrays and parameters:
+    Args:
         origin, direction: (3,); depth: metres along the ray.
         newest, band, points, first, offset, span: as in ``band_samples``.
     """
@@ -189,7 +189,7 @@ def _guided_samples(origin, direction, depth, newest, band, points, first, offse
 def _composited(y, first, w, offset, colour):  # type: ignore[no-untyped-def]
     """Write the colour of a ray (3,), and return the mean place of its samples in the band.
 
-    Arrays and parameters:
+    Args:
         y: outputs of the network, (4, BLOCK); the ray's samples begin at ``first``.
         w, offset: weights and places of the samples, (SAMPLES,).
         colour: out, 0..1, (3,).
@@ -214,7 +214,7 @@ def composite(  # type: ignore[no-untyped-def]
 ):
     """Render rays by compositing around their guiding depth: hash grid, network and sums in one pass.
 
-    Arrays and parameters:
+    Args:
         band: truncation distance of the newest keyframe, whose camera is ``focus[0, :3]``.
         depth_share: weight of the guiding depth in the resulting depth; the rest is the mean over the samples.
         origin: (3,); directions: (P, 3).
