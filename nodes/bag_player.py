@@ -11,7 +11,7 @@ from instant_ic.bag import BagError, BagMessage
 from instant_ic.bag.live_nodes import refuse_base, wait_for_readers
 from instant_ic.bag.player import CLOCK_HZ, BagPlayer, BagPlayerConfig
 from instant_ic.bag.transforms import TRANSFORM_TOPICS, without_children
-from instant_ic.bus import RELIABLE, Node, NodeError, main, registry
+from instant_ic.bus import RELIABLE, Node, NodeError, Publisher, main, registry
 from instant_ic.bus.clock import ManualClock
 from instant_ic.msg import message_type, register_type, to_time
 
@@ -37,7 +37,9 @@ class BagPlayerNode(Node[BagPlayerConfig]):
             if self.player is not None:
                 self.player.close()
             raise NodeError(str(error)) from None
-        self._clock_out = self.publisher("/clock", message_type("Clock"), RELIABLE)
+        self._clock_out: Publisher | None = None
+        if self.config.publish_clock:
+            self._clock_out = self.publisher("/clock", message_type("Clock"), RELIABLE)
         for topic in self.player.topics:  # foreign message types are defined in the bag
             register_type(topic.type_name, topic.schema.text)
         self._out = {t.topic: self.publisher_raw(t.topic, t.type_name, t.qos) for t in self.player.topics}
@@ -99,7 +101,8 @@ class BagPlayerNode(Node[BagPlayerConfig]):
         """Publish the time before each message, and keep it running where there are none."""
         if isinstance(self.clock, ManualClock):
             self.clock.set(stamp_ns)
-        self._clock_out.publish(message_type("Clock")(clock=to_time(stamp_ns)))
+        if self._clock_out is not None:
+            self._clock_out.publish(message_type("Clock")(clock=to_time(stamp_ns)))
 
     def reconfigure(self, config: BagPlayerConfig) -> None:
         """Apply a new rate at once."""

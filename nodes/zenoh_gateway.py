@@ -24,7 +24,6 @@ from instant_ic.bus.registry import TopicWatch
 from instant_ic.msg import MessageError
 
 _AGAIN_S = 2.0
-_LOOK_S = 0.2  # between searches for new and removed topics
 
 
 class ZenohGatewayNode(Node[ZenohGatewayConfig]):
@@ -63,7 +62,7 @@ class ZenohGatewayNode(Node[ZenohGatewayConfig]):
             self._opener = self.background(self.open, self.opened)
             self._opener.submit(None)
             self.timer(_AGAIN_S, self.try_again)
-        self.timer(_LOOK_S, self.look)
+        self.timer(config.discovery_period_s, self.look)
         self.timer(1.0, self.report)
 
     def open(self, _: None) -> RosSession | ZenohError:

@@ -58,6 +58,7 @@ class BagPlayerConfig(PlayOptions):
     Attributes:
         bag: folder of the bag, or a ``.mcap`` file.
         drop_transforms: child frames whose transforms are left out of ``/tf`` because another node broadcasts them.
+        publish_clock: whether to publish ``/clock``.
         delay_s: seconds for which the time stands still at the start, so that subscribers find the topics.
         wait_for: nodes that must run, with all their subscriptions connected, before playback starts.
         force: play commands and states although a base is running, which may move the robot.
@@ -65,6 +66,7 @@ class BagPlayerConfig(PlayOptions):
 
     bag: str = ""
     drop_transforms: tuple[str, ...] = ()
+    publish_clock: bool = True
     delay_s: NotNegative = 0.5
     wait_for: tuple[str, ...] = ()
     force: bool = False

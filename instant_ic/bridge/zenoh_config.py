@@ -29,6 +29,7 @@ class ZenohGatewayConfig:
             simulation; anybody who can run a program on it can then drive. Refused beside a real base.
         unprotected: allows it beside a real base, with a permanent warning.
         limits: limits on the commands.
+        discovery_period_s: seconds between searches for new and removed topics.
     """
 
     namespace: str = ""
@@ -42,6 +43,7 @@ class ZenohGatewayConfig:
     insecure_loopback_commands: bool = False
     unprotected: bool = False
     limits: CommandLimits = field(default_factory=CommandLimits)
+    discovery_period_s: Annotated[float, Range(0.05, 10)] = 0.2
 
     def __post_init__(self) -> None:
         check_ranges(self)

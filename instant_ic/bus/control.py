@@ -141,6 +141,7 @@ class ControlServer:
     def _operations(self) -> dict[str, Callable[[dict[str, Any]], dict[str, Any]]]:
         return {
             "describe": self._describe,
+            "get": self._get,
             "set": self._set,
             "log_level": self._log_level,
             "status": self._status,
@@ -149,6 +150,9 @@ class ControlServer:
 
     def _describe(self, request: dict[str, Any]) -> dict[str, Any]:
         return {"parameters": [asdict(info) for info in self._node.parameters.infos()]}
+
+    def _get(self, request: dict[str, Any]) -> dict[str, Any]:
+        return {"values": {info.name: info.value for info in self._node.parameters.infos()}}
 
     def _set(self, request: dict[str, Any]) -> dict[str, Any]:
         values, texts = request.get("values", {}), request.get("yaml", {})
@@ -241,7 +245,8 @@ class NodeControl:
 
     def get(self) -> dict[str, Any]:
         """Return the value of every parameter."""
-        return {info.name: info.value for info in self.describe()}
+        values: dict[str, Any] = self.request({"op": "get"})["values"]
+        return values
 
     def set(self, values: Mapping[str, Any]) -> dict[str, Any]:
         """Change several parameters together, or none; returns those whose value has changed.

@@ -58,6 +58,7 @@ def play(args: argparse.Namespace) -> int:
         start_paused=args.start_paused,
         topics=topic_names(args.topics),
         exclude=topic_names(args.exclude),
+        publish_clock=not args.no_clock,
         delay_s=args.delay,
         wait_for=args.wait_for,
         force=args.force,

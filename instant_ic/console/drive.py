@@ -6,6 +6,7 @@ The caller passes the time, in seconds of one monotonic clock, so that tests nee
 from __future__ import annotations
 
 import math
+from collections import Counter, deque
 from dataclasses import dataclass
 from typing import Annotated
 
@@ -14,6 +15,7 @@ from instant_ic.control.command_gate import CommandGate, GateLimits
 from instant_ic.control.robot_lease import Verdict
 from instant_ic.util.step_gap import StepGap
 
+RATE_COMMANDS = 200  # newest commands kept to measure the rate
 CONFIRM_S = 1.0  # time in which the robot confirms a press of the emergency stop; until then the press counts
 LOOK_S = 0.1
 """Longest time between two steps of the server while there is a driver."""
@@ -71,8 +73,10 @@ class DriveGate:
         self.estop = False
         self._robot_known = False  # the robot reports its emergency stop
         self._pressed = -math.inf  # emergency stop pressed here and not confirmed by the robot
+        self.counts: Counter[Verdict] = Counter()
         self.watchdog_trips = 0
         self.last_age_s: float | None = None
+        self._accepted: deque[float] = deque(maxlen=RATE_COMMANDS)
         self._driver_seen = -math.inf
         self._driver_beat = -math.inf
         self._sequence: dict[int, int] = {}
@@ -159,11 +163,13 @@ class DriveGate:
             self._let_go_since = now
         refusal = self._gate.check_twist(linear, angular)
         verdict = self._judge(client, sequence, age_s, moves) if refusal is None else refusal.verdict
+        self.counts[verdict] += 1
         if verdict is not Verdict.ACCEPTED:
             return verdict
         self._sequence[client] = sequence
         self._driver_seen = now
         self.last_age_s = age_s
+        self._accepted.append(now)
         limits = self.config
         command = (
             _clamp(linear, limits.max_linear_mps),
@@ -186,6 +192,10 @@ class DriveGate:
         if self.estop:
             return Verdict.STOPPED
         return Verdict.HELD if self._held and moves else Verdict.ACCEPTED
+
+    def rate_hz(self, now: float) -> float:
+        """Commands accepted within the last second."""
+        return float(sum(now - at <= 1.0 for at in self._accepted))
 
     def stop(self, now: float) -> None:
         """Set the command to zero."""

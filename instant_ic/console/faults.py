@@ -1,6 +1,8 @@
-"""Faults of the nodes for the operator: diagnoses and missing heartbeats."""
+"""Faults and CPU of the nodes for the operator: diagnoses and missing heartbeats."""
 
 from __future__ import annotations
+
+from typing import Any
 
 from instant_ic.msg import DiagnosticArray, NodeStatus
 
@@ -16,6 +18,15 @@ class FaultList:
     def __init__(self) -> None:
         self._diagnoses: dict[str, tuple[int, str, float]] = {}
         self._heartbeats: dict[str, tuple[float, bool]] = {}
+        self._cpu_percent: dict[str, float] = {}
+
+    def nodes(self, now_s: float) -> list[dict[str, Any]]:
+        """Return the running nodes: ``name``, and ``cpu_percent`` of one core."""
+        return [
+            {"name": name, "cpu_percent": round(self._cpu_percent[name], 1)}
+            for name, (seen_s, stopping) in sorted(self._heartbeats.items())
+            if not stopping and now_s - seen_s <= TIMEOUT_S
+        ]
 
     def take_diagnoses(self, message: DiagnosticArray, now_s: float) -> None:
         """Store the newest diagnosis of each name."""
@@ -31,6 +42,7 @@ class FaultList:
         if message.node not in self._heartbeats and len(self._heartbeats) >= MOST_NAMES:
             return
         self._heartbeats[message.node] = (now_s, int(message.state) == NodeStatus.STOPPING)
+        self._cpu_percent[message.node] = float(message.cpu_percent)
 
     def worst(self, now_s: float) -> list[dict[str, str]]:
         """Return the worst present fault of each node, worst first: ``level`` (warn, error), ``name``, ``text``."""

@@ -236,7 +236,7 @@ class PageFeed:
         self.server.publish("plan", page.plan_message(self.display, self.poses, *newest))
 
     def send_health(self) -> None:
-        """Send virtual space, battery, and faults in the text of the node that found them."""
+        """Send virtual space, battery, CPU of the nodes, and faults in the text of the node that found them."""
         age_s = self.display.image_age_s(self._clock.steady_ns())
         self._check("camera", age_s <= IMAGE_TIMEOUT_S, "no image from the camera", age_s=age_s)
         self._check("controller", self._inputs.control.message is not None, "no state from the arbiter")
@@ -246,7 +246,8 @@ class PageFeed:
         if self.server.plain_http:  # on the page only, not as a diagnosis: the node itself works
             faults.append({"level": "warn", "name": "network", "text": PLAIN_HTTP})
         newest = self._inputs.vspace.message, self._inputs.battery.message
-        self.server.publish("health", page.health_message(*newest, faults, current().text))
+        nodes = self.faults.nodes(now_s)
+        self.server.publish("health", page.health_message(*newest, faults, nodes, current().text))
 
     def send_grids(self) -> None:
         """Send map and costmap if they have changed."""

@@ -47,7 +47,13 @@ def state_message(
     return state | {
         "reason": control.reason,
         "estop": bool(control.estop),
+        "blocked": bool(control.blocked),
+        "transitions": int(control.transitions),
         "command": [finite(value) for value in twist_values(control.operator_command)],
+        "applied": [finite(value) for value in twist_values(control.applied_command)],
+        "pose_gap_m": finite(control.pose_gap_m),
+        "yaw_gap_rad": finite(control.yaw_gap_rad),
+        "time_to_obstacle_s": finite(control.time_to_obstacle_s),
     }
 
 
@@ -67,10 +73,11 @@ def health_message(
     vspace: VspaceStatus | None,
     battery: BatteryState | None,
     faults: list[dict[str, str]],
+    nodes: list[dict[str, Any]],
     pace: str,
 ) -> dict[str, Any]:
     """Return the ``health`` message; ``pace`` is empty in real time."""
-    return {"vspace": _vspace(vspace), "battery": _battery(battery), "faults": faults, "pace": pace}
+    return {"vspace": _vspace(vspace), "battery": _battery(battery), "faults": faults, "nodes": nodes, "pace": pace}
 
 
 def _vspace(status: VspaceStatus | None) -> dict[str, Any] | None:
@@ -108,6 +115,9 @@ def view_header(captured_ms: float, view: RenderedView) -> dict[str, Any]:
         "captured_ms": captured_ms,
         **pose_fields(matrix_from_pose(view.pose)),
         "fov": float(view.fov_rad),
+        "confidence": finite(view.confidence),
+        "render_ms": finite(view.render_ms),
+        "request_id": int(view.request_id),
     }
 
 

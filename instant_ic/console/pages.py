@@ -220,8 +220,11 @@ class Pages:
         session.reply(
             {
                 "type": "hello",
+                "client": session.number,
+                "server_ms": now_ms(),
                 "max_linear": drive.max_linear_mps,
                 "max_angular": drive.max_angular_rps,
+                "rate_hz": drive.rate_hz,
                 "may_drive": session.may_drive,
                 "page": self.page,
             }
@@ -325,6 +328,7 @@ class Pages:
                 "client_ms": number(message, "client_ms"),
                 "server_ms": now_ms(),
                 "command_age_ms": None if age_s is None else max(age_s, 0.0) * 1000.0 / factor,
+                "command_hz": round(self._drive.gate.rate_hz(now) * factor),
             }
         )
 

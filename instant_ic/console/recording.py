@@ -120,6 +120,8 @@ class RecordingDesk:
             "path": recording.get("path", ""),
             "seconds": recording.get("seconds", 0.0),
             "bytes": recording.get("bytes", 0),
+            "free_bytes": recording.get("free_bytes"),
+            "cached_s": status.get("cached_s", 0.0),
         }
 
 

@@ -361,8 +361,16 @@ class ConsoleServer:
         return web.FileResponse(STATIC / "index.html")
 
     async def _health(self, request: web.Request) -> web.StreamResponse:
-        """Tell a page whose WebSocket was refused, by the status alone, whether a sign-in is missing."""
-        return web.Response(status=204)
+        gate = self.drive.gate
+        return web.json_response(
+            {
+                "clients": len(self.pages.sessions),
+                "driver": gate.driver,
+                "estop": gate.estop,
+                "watchdog_trips": gate.watchdog_trips,
+                "commands": {verdict.name.lower(): count for verdict, count in gate.counts.items()},
+            }
+        )
 
     async def _estop(self, request: web.Request) -> web.StreamResponse:
         """Set the emergency stop without the page's WebSocket, which may be stuck but alone can release it."""

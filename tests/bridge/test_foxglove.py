@@ -293,6 +293,8 @@ def test_a_stalled_loop_or_viewer_never_holds_the_node_up_and_what_is_dropped_is
     [
         "not json",
         "[]",
+        "{}",
+        '{"op": 1}',
         '{"op": "subscribe"}',
         '{"op": "subscribe", "subscriptions": [1]}',
         '{"op": "subscribe", "subscriptions": [{"id": -1, "channelId": 1}]}',

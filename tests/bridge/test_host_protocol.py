@@ -184,6 +184,15 @@ def test_the_shortest_round_trip_counts_for_as_long_as_it_is_recent():
     assert (clock.offset_ns, clock.min_rtt_ns) == (5_000, 50_000)
 
 
+def test_stamps_that_cannot_be_are_left_out():
+    clock = ClockFilter()
+    assert clock.add(1000, 0, 2000, 1500) is None  # answered for longer than the whole took
+    assert clock.add(1000, 10, 0, 1500) is None
+    assert not clock.ready
+    with pytest.raises(ValueError, match="no exchange"):
+        _ = clock.offset_ns
+
+
 def test_window_grows_without_a_queue_and_shrinks_with_one():
     window = Window(target_s=0.05, least=8192, most=1 << 20, start=65536)
     now = 0

@@ -234,7 +234,7 @@ def test_log_level(tuned):
         (b"\xff\xfe", "not JSON"),
         (b"[1]", "expected a JSON object"),
         (b"[" * 100_000, "not JSON"),
-        (b'{"op": "explode"}', "unknown op 'explode' (known: describe, set, log_level, status, call)"),
+        (b'{"op": "explode"}', "unknown op 'explode' (known: describe, get, set, log_level, status, call)"),
         (b'{"op": "set", "values": [1]}', 'set needs "values"'),
         (b'{"op": "set", "values": {"inner": 3}}', "is a group"),
     ],

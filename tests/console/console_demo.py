@@ -59,8 +59,9 @@ class DemoRecorder:
         recording = {"state": self.state, "path": path, "seconds": round(seconds, 1), "bytes": int(2e6 * seconds)}
         return {
             "path": path,
+            "cached_s": 60.0,
             "snapshots": self.snapshots,
-            "recording": recording | {"error": self.error},
+            "recording": recording | {"error": self.error, "free_bytes": 50_000_000_000},
         }
 
 
@@ -83,6 +84,7 @@ class Demo:
         self.forced_mode = "real"
         self.faults: list[dict[str, str]] = []
         self.pace = ""
+        self.nodes = [{"name": "nerf", "cpu_percent": 12.0}]
         self.images = True
         self.tint = (1.0, 1.0, 1.0)  # gains of the rendered view: blue, green, red
         self.version = 0
@@ -94,6 +96,7 @@ class Demo:
         self.costmap: GridImage | None = None
         self._command = (0.0, 0.0)
         self.placing = threading.Lock()
+        self._transitions = 0
         self._slow_due = 0.0
         self._directions = equirect_directions(self.config.panorama_width, self.config.panorama_width // 2)
         self.panorama, self.panorama_camera = b"", np.zeros((4, 4))  # last panorama (JPEG) and its camera pose
@@ -207,6 +210,7 @@ class Demo:
             self.mode, self.reason = "stopped", text if self.button else "emergency stop: release it to continue"
         else:
             self.mode, self.reason = self.forced_mode, ""
+        self._transitions += before != self.mode
         if self.mode == "virtual":
             if before != "virtual":
                 self.vbot = self.robot.copy()
@@ -227,9 +231,12 @@ class Demo:
                 "shown": "virtual" if self.mode == "virtual" else "real",
                 "reason": self.reason,
                 "estop": self.estop or self.button,
+                "blocked": False,
+                "transitions": self._transitions,
                 "robot": self.robot.round(4).tolist(),
                 "vbot": self.vbot.round(4).tolist() if self.mode == "virtual" else None,
                 "command": [v, w],
+                "applied": [v, w],
                 "twist": [v, w],
             },
         )
@@ -243,7 +250,7 @@ class Demo:
         vspace = {"state": "ready", "psnr_db": 27.4, "train_seconds": 9.0, "message": ""}
         vspace |= {"expected_psnr_db": 25.6, "unseen_share": 0.03, "radius_m": 2.0}
         battery = {"voltage": 24.6, "percent": 81.0}
-        health = {"vspace": vspace, "battery": battery, "faults": self.faults, "pace": self.pace}
+        health = {"vspace": vspace, "battery": battery, "faults": self.faults, "nodes": self.nodes, "pace": self.pace}
         self.server.publish("health", health)
 
     def _send_panorama(self) -> None:
@@ -268,6 +275,8 @@ class Demo:
             "q": quaternion_from_matrix(camera).tolist(),
             "p": camera[:3, 3].tolist(),
             "fov": shape.fov_rad,
+            "confidence": 0.9,
+            "render_ms": 20.0,
         }
         self.server.send_frame(FrameKind.VIEW, header, _jpeg(image))
 

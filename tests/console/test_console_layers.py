@@ -11,15 +11,12 @@ from console_servers import WAIT_S, until
 
 from instant_ic.console import ConsoleClient, FrameKind, PageProtocolError
 from instant_ic.console import pages as pages_module
-from instant_ic.console.layer_meshes import EDGE_RATIO, LayerMeshes
+from instant_ic.console.layer_meshes import LayerMeshes
 from instant_ic.console.layers import PageLayer, PageLayers
 from instant_ic.console.protocol import Parts, decode_frame
 from instant_ic.console.session import PART_BYTES
 from instant_ic.geometry.poses import pose_matrix
-from instant_ic.geometry.projections import equirect_directions
-from instant_ic.vspace.layer_mesh import layer_mesh
 from instant_ic.vspace.layers import Content, DecodedLayer, Kind, Layer, Layers
-from instant_ic.vspace.prior import edge_quads
 
 
 def layer(image=b"JPEG", **values):
@@ -254,21 +251,3 @@ def test_meshes_are_made_once_and_what_was_seen_comes_before_all_guesses(monkeyp
     meshes.layers(version_of(encoded(4)))
     meshes.layers(version_of(encoded(1)))
     assert calls == [1, 3, 2, 4, 1]  # forgotten meanwhile
-
-
-def test_the_rim_of_a_surface_is_straight():
-    """A slab before a wall, seen from aside: its rim's vertices lie on one line, each row's on the next one's."""
-
-    directions = equirect_directions(256, 128)
-    slab = np.abs(np.arctan2(directions[..., 1], directions[..., 0])) < 0.4
-    # The slab leans: on the plane x - y = 2. Behind it a sphere of 8 m.
-    inverse = np.where(slab, (directions[..., 0] - directions[..., 1]) / 2, 1 / 8).astype(np.float32)
-    inverse = np.maximum(inverse, np.float32(0.01))
-    mesh = layer_mesh(inverse, edge_quads(inverse, EDGE_RATIO), np.ones_like(slab))
-    row = (mesh.corners[:, 1] > 44) & (mesh.corners[:, 1] < 84)
-    rim = row & (mesh.corners[:, 0] == np.flatnonzero(slab[64])[-1] + 1) & (mesh.inverse_depth > 0.2)
-    azimuth = math.pi - mesh.corners[rim, 0] * (2 * math.pi / 256)
-    elevation = math.pi / 2 - mesh.corners[rim, 1] * (math.pi / 128)
-    on_plane = np.cos(elevation) * (np.cos(azimuth) - np.sin(azimuth)) / 2
-    assert rim.sum() > 30
-    assert mesh.inverse_depth[rim] == pytest.approx(on_plane, abs=0.002)  # half a pixel inwards it is 0.008 less

@@ -208,12 +208,13 @@ def test_panorama_passes_as_it_came_with_the_cameras_heading_and_age(setup):
 def test_state_tells_mode_poses_and_reason(setup):
     bus, _, server = setup
     publish_tree(bus)
-    bus.publish("/ic/state", control(bus, ControlState.REAL, reason="why"), latched=True)
+    bus.publish("/ic/state", control(bus, ControlState.REAL, reason="why", blocked=True), latched=True)
     bus.advance(0.06)
     state = server.texts["state"]
-    assert (state["mode"], state["reason"]) == ("real", "why")
+    assert (state["mode"], state["reason"], state["blocked"]) == ("real", "why", True)
     assert state["robot"] == pytest.approx([1, 2, math.pi / 2], abs=1e-3)
     assert state["vbot"] is None
+    assert state["time_to_obstacle_s"] is None  # inf is no JSON
     assert server.shown == (FrameKind.PANORAMA,)
 
 
@@ -264,6 +265,7 @@ def test_only_one_request_is_outstanding_and_the_rate_follows_the_answers(setup)
     _, frame_header, payload = next(f for f in server.frames if f[0] is FrameKind.VIEW)
     assert payload == b"VIEW"
     assert frame_header["fov"] == pytest.approx(1.8)
+    assert frame_header["render_ms"] is None
     assert frame_header["p"] == pytest.approx([1, 2, 1.5])
 
 
@@ -464,6 +466,17 @@ def heartbeat(node, state):
         input_lost=np.zeros(0, np.uint64), lost_topics=[], lost_publishers=[], lost_counts=np.zeros(0, np.uint64),
         outputs=[], output_rates_hz=np.zeros(0, np.float32), output_ages_s=np.zeros(0, np.float32),
     )  # fmt: skip
+
+
+def test_health_lists_the_cpu_of_the_running_nodes(setup):
+    bus, _, server = setup
+    bus.publish("/heartbeat", dataclasses.replace(heartbeat("nerf", NodeStatus.RUNNING), cpu_percent=21.26))
+    bus.publish("/heartbeat", heartbeat("mine", NodeStatus.RUNNING))
+    bus.publish("/heartbeat", heartbeat("bag_player", NodeStatus.STOPPING))
+    bus.advance(1.1)
+    nodes = {node["name"]: node for node in server.texts["health"]["nodes"]}
+    assert nodes["nerf"] == {"name": "nerf", "cpu_percent": 21.3}
+    assert "mine" in nodes and "bag_player" not in nodes
 
 
 def test_dead_node_is_a_fault_and_one_that_ended_is_not(setup):

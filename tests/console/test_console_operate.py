@@ -1,14 +1,18 @@
 """What the operator has besides driving, in Chromium: recording, overlay, a phone, no mouse, no colours."""
 
+import io
 import itertools
 import re
 
+import numpy as np
 import pytest
 from console_pages import (
     BROWSER_TEST,
     expect_body,
+    likeness_of,
     push_stick,
     release_stick,
+    room_seen,
     start_driving,
     wait_stopped,
     wait_until,
@@ -57,22 +61,49 @@ def test_the_last_minute_is_kept(driver, shared_demo):
     assert driver.locator("#more").is_hidden()
 
 
+def saved(page, act):
+    with page.expect_download() as waiting:
+        act()
+    return waiting.value.suggested_filename, waiting.value.path().read_bytes()
+
+
+def test_the_view_is_saved(driver, shared_demo):
+    from PIL import Image
+
+    shared_demo.place(-1.0, -0.5, 0.4)
+    driver.keyboard.press("c")
+    wait_until(lambda: abs(shared_demo.look.yaw) < 0.01, driver, "straight ahead")
+    seen = room_seen(shared_demo.robot, shared_demo.look.yaw, shared_demo.look.pitch)
+    for _ in range(100):  # the panorama of the new place comes
+        name, data = saved(driver, lambda: driver.keyboard.press("p"))
+        shown = np.asarray(Image.open(io.BytesIO(data)).convert("RGB"), float)
+        if (found := likeness_of(shown, seen)) > 0.9:
+            break
+    assert re.fullmatch(r"view_\d{8}_\d{6}\.png", name) and data[:4] == b"\x89PNG"
+    assert shown.shape == (600, 960, 3) and found > 0.9  # of the panorama's few pixels
+
+
 # ---- overlay ----------------------------------------------------------------------------------------
 
 
-def test_latencies_and_readiness_are_told(driver, shared_demo):
-    wait_until(lambda: re.fullmatch(r"\d+ ms", text_of(driver, "#link-ms")), driver, "the link")
+def test_link_rates_and_readiness_are_told(driver, shared_demo):
+    wait_until(lambda: re.fullmatch(r"\d+ ms · (good|fair|poor)", text_of(driver, "#link-ms")), driver, "the link")
     wait_until(lambda: re.fullmatch(r"\d+ ms", text_of(driver, "#camera-ms")), driver, "the camera's latency")
     assert text_of(driver, "#vspace") == "Virtual space ready · 26 dB here · 97 % seen · within 2.0 m"
     assert text_of(driver, "#battery") == "24.6 V · 81 %"
+    wait_until(lambda: re.fullmatch(r"\d+ · \d+ /s", text_of(driver, "#rates")), driver, "rates of pictures")
     start_driving(driver, shared_demo)
-    wait_until(lambda: re.fullmatch(r"\d+ ms", text_of(driver, "#command-ms")), driver, "delay of commands")
+    wait_until(lambda: re.fullmatch(r"\d+ ms · \d+ /s", text_of(driver, "#command-ms")), driver, "rate of commands")
 
 
-def test_a_large_map_and_help_by_key(driver):
+def test_a_large_map_full_screen_and_help_by_key(driver):
     driver.keyboard.press("m")
     driver.get_by_role("button", name="Shrink the map").wait_for()
     driver.keyboard.press("m")
+    driver.keyboard.press("f")
+    driver.wait_for_function("document.fullscreenElement !== null")
+    driver.keyboard.press("f")
+    driver.wait_for_function("document.fullscreenElement === null")
     driver.keyboard.press("h")
     driver.get_by_role("dialog", name="Help").wait_for()
     driver.keyboard.press("h")
@@ -104,7 +135,7 @@ def test_every_control_has_a_name_and_is_reached_by_tab(driver):
             "[...document.querySelectorAll('button, input')].filter((e) => e.checkVisibility()).map((e) => e.id)"
         )
     )
-    assert {"record", "more-open", "help-open", "map-size", "scale", "estop"} <= set(reached)
+    assert {"record", "more-open", "help-open", "fullscreen", "map-size", "scale", "estop"} <= set(reached)
     assert outlines == {"solid"}  # where the focus is can be seen
     assert not driver.evaluate("[...document.images].filter((i) => !i.alt).length")
 

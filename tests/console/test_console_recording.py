@@ -27,9 +27,9 @@ class FakeRecorder:
         if command == "status":
             recording = {
                 "state": self.state, "path": "/d/rec_1", "seconds": 12.5, "bytes": 3_000_000, "messages": 9,
-                "error": self.error,
+                "error": self.error, "free_bytes": 10**9,
             }  # fmt: skip
-            return {"path": "/d", "error": "", "recording": recording}
+            return {"path": "/d", "error": "", "cached_s": 60.0, "recording": recording}
         self.asked.append((command, arguments))
         if command == "record":
             self.state = "recording"
@@ -59,7 +59,7 @@ def test_a_recording_is_begun_told_and_ended(desk):
     assert wait_for(lambda m: m["state"] == "idle")["recorder"] == "ok"
     made.record(True)
     told = wait_for(lambda m: m["state"] == "recording")
-    assert (told["path"], told["seconds"], told["bytes"]) == ("/d/rec_1", 12.5, 3_000_000)
+    assert (told["path"], told["seconds"], told["bytes"], told["free_bytes"]) == ("/d/rec_1", 12.5, 3_000_000, 10**9)
     assert told["notice"] == {"number": 1, "text": "Recording to rec_1", "level": "ok"}
     made.record(False)
     made.snapshot()

@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 import pytest
+from control_world import BEAMS, LIDAR_MAX_M, LIDAR_MIN_M, World, corridor, draw_map, matrix, rectangle
 
 from instant_ic.control.costmap import (
     FREE,
@@ -22,6 +23,7 @@ from instant_ic.control.costmap import (
     scan_rays,
 )
 from instant_ic.control.footprint import Footprint
+from instant_ic.control.kinematics import MotionLimits
 
 CONFIG = CostmapConfig(width=4.0, footprint_clearing_enabled=False)
 
@@ -196,3 +198,30 @@ class TestGhosts:
             for _ in range(300):
                 costmap = rolling.update(np.zeros(3), self.ghost(), rays)
             assert costmap.cost_at(place) == LETHAL
+
+    def test_ghosts_beside_an_obstacle_close_the_way_round_only_for_a_while(self) -> None:
+        """A map with two walls that are not there, from scans put in the wrong place on a busy machine."""
+        from instant_ic.control.passage import PassageConfig, find_passage
+        from instant_ic.control.planner import HybridPlanner, PlannerConfig
+        from instant_ic.control.prediction import PredictionConfig, Predictor
+        from instant_ic.control.states import Reason
+
+        walls = corridor()
+        ghosts = np.array([[[2.7, -1.2], [2.7, -0.3]], [[2.7, 0.3], [2.7, 1.2]]])
+        world = World(np.concatenate([walls, rectangle(2.5, -0.25, 3.0, 0.25)]))
+        static = draw_map(np.concatenate([walls, ghosts]), (-2, -1.2, 14, 1.2))
+        robot, forward, config = np.array([1.7, 0.0, 0.0]), (0.4, 0.0), CostmapConfig()
+        rays = scan_rays(
+            world.cast(*robot), -math.pi, 2 * math.pi / BEAMS, LIDAR_MIN_M, LIDAR_MAX_M, matrix(robot), config
+        )
+        rolling, reasons = RollingCostmap(config, Footprint()), []
+        predictor = Predictor(PredictionConfig(), MotionLimits(), Footprint())
+        for k in range(config.static_seen_through + 1):
+            costmap = rolling.update(robot, static, rays)
+            if k in (0, config.static_seen_through):
+                ahead = predictor.predict(robot, forward, forward, costmap)
+                planner = HybridPlanner(PlannerConfig())
+                reasons.append(find_passage(costmap, ahead, True, None, planner, PassageConfig()))
+        assert reasons[0].reason == Reason.NO_WAY_ROUND
+        assert "(no way to the goal: " in reasons[0].text
+        assert reasons[1] is None

@@ -286,6 +286,20 @@ def test_a_changed_command_is_obeyed_before_the_next_timer() -> None:
     assert len(stack.bus.records("/cmd_vel")) == count + 1
 
 
+def test_emergency_stop_acts_at_once_and_holds() -> None:
+    stack = Stack(np.zeros((0, 2, 2)))
+    stack.drive(1.5, None)
+    stack.drive(1.0, (0.4, 0.0))
+    stack.bus.publish("/operator/estop", Bool(data=True), latched=True)
+    assert twist_values(stack.bus.last("/cmd_vel")) == (0.0, 0.0)  # before any timer
+    states = stack.drive(1.0, (0.4, 0.0))
+    assert {s.mode for s in states} == {ControlState.STOPPED}
+    assert states[-1].estop
+    stack.bus.publish("/operator/estop", Bool(data=False), latched=True)
+    assert stack.drive(1.0, (0.4, 0.0))[-1].mode == ControlState.STOPPED  # the key is still down
+    assert stack.drive(0.5, (0.0, 0.0))[-1].mode == ControlState.REAL
+
+
 def lose_the_operator(stack: Stack, beats_end_s: float, hidden: bool = False, console_dies: bool = False) -> float:
     """Runs on in VIRTUAL with hands off and the console's gate before the arbiter; seconds to the zero command.
 

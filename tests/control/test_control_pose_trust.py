@@ -95,3 +95,8 @@ def test_no_switch_with_a_pose_in_doubt() -> None:
     assert made.modes() == ["STOPPED", "REAL"]
     assert made.frames[-1].decision.reason_code == Reason.POSE_DOUBTFUL
     assert made.frames[-1].command == NOTHING
+
+
+def test_the_thresholds_are_in_order() -> None:
+    with pytest.raises(ValueError, match="stop must be >= slow"):
+        PoseTrustConfig(slow=0.6, stop=0.5)

@@ -336,6 +336,21 @@ def test_no_entry_where_the_view_would_be_bad_and_an_unknown_quality_is_none() -
             assert "too poorly (9 dB expected, 12 dB needed)" in made.steps[-1].reason
 
 
+def test_without_views_in_the_virtual_space_both_robots_stand() -> None:
+    made = before_box()
+    made.until(Mode.VIRTUAL, FORWARD)
+    made.drive(0.5, FORWARD)
+    made.ages["view"] = 0.36
+    decision = made.step(FORWARD)
+    assert (decision.command, decision.vbot_action) == (NOTHING, VbotAction.HELD)
+    assert "no view of the virtual space for 0.4 s" in decision.reason
+    stood = made.drive(0.6, FORWARD) and made.vbot.pose.copy()
+    made.drive(0.6, FORWARD)
+    np.testing.assert_allclose(made.vbot.pose, stood, atol=1e-9)
+    made.ages["view"] = 1.6
+    assert made.step(FORWARD).mode == Mode.STOPPED
+
+
 def test_a_vbot_left_inside_an_obstacle_is_led_back_gently_and_told_and_a_command_ends_it() -> None:
     walls = corridor()
     made = Loop(World(np.concatenate([walls, rectangle(2.5, -0.25, 3.0, 0.25)])), draw_map(walls, (-2, -1.2, 14, 1.2)))

@@ -129,6 +129,19 @@ def test_a_restarted_arbiter_waits_for_a_release() -> None:
     assert set(commands(stack, since)) == {NOTHING}
 
 
+@pytest.mark.parametrize("mode", [Mode.REAL, Mode.VIRTUAL])
+def test_after_a_short_freeze_the_motion_resumes_by_itself(mode: Mode) -> None:
+    stack = stack_in(mode)
+    freeze(stack, ["arbiter"], 0.8)
+    since = len(stack.bus.records("/cmd_vel"))
+    states = stack.drive(2.0, KEY)
+    sent = stack.bus.messages("/cmd_vel")[since:]
+    assert twist_values(sent[0]) == NOTHING
+    assert sent[0].header.frame_id == HARD_STOP
+    assert Mode.STOPPED not in {state.mode for state in states}
+    assert max(abs(v) for v, _ in commands(stack, since)) > 0.1
+
+
 def test_short_freezes_that_repeat_never_let_the_robot_move() -> None:
     stack = stack_in(Mode.REAL)
     freeze(stack, ["arbiter"], 0.4)

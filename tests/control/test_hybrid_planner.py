@@ -123,6 +123,18 @@ def test_unknown_space_is_driven_up_to() -> None:
     assert (patch.cost_at(round_it.poses[:, :2]) != UNKNOWN).all()
 
 
+def test_every_reason_says_why() -> None:
+    closed = room((1.5, -4.0, 1.6, 4.0))
+    assert "obstacles close it off" in plan(closed, (0.0, 0.0, 0.0), (3.0, 0.0, 0.0)).reason
+    taken = plan(room((1.5, -0.5, 2.5, 0.5)), (0.0, 0.0, 0.0), (1.6, 0.0, 0.0))
+    assert "the goal is on an obstacle" in taken.reason
+    assert math.isfinite(taken.whole_length_m)
+    assert "outside the costmap" in plan(room(), (0.0, 0.0, 0.0), (9.0, 0.0, 0.0)).reason
+    assert "the robot is outside" in plan(room(), (9.0, 0.0, 0.0), (0.0, 0.0, 0.0)).reason
+    maze = room((1.0, -3.0, 1.1, 4.0), (2.0, -4.0, 2.1, 3.0))
+    assert "within 5 steps of the search" in plan(maze, (0, 0, 0), (3.0, 0, 0), max_iterations=5).reason
+
+
 @pytest.mark.parametrize("seed", range(3))
 def test_no_pose_of_any_path_touches_anything(seed: int) -> None:
     """Random posts and blocks; every pose and every 5 cm between them by the oracle above."""

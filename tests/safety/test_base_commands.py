@@ -6,7 +6,7 @@ import pytest
 from base_line import NodeBench
 
 from instant_ic.bus import OK, WARN
-from instant_ic.msg import HARD_STOP, Vector3
+from instant_ic.msg import HARD_STOP, Twist, Vector3
 
 ZERO = Vector3(x=0.0, y=0.0, z=0.0)
 
@@ -35,6 +35,17 @@ def test_the_arbiter_drives_on_beside_a_second_publisher() -> None:
         bench.command(-0.3, "bag_player")
     assert bench.line.robot.pose[0] > 0.1
     assert bench.line.robot.twist[0] == pytest.approx(0.3, abs=0.01)
+
+
+def test_a_bag_of_plain_twists_beside_a_running_stack_with_the_stop_latched_drives_nothing() -> None:
+    bench = NodeBench()
+    bench.run(0.5)
+    bench.estop(True)
+    for _ in range(24):
+        bench.bus.publish("/cmd_vel", Twist(linear=Vector3(x=0.3, y=0.0, z=0.0), angular=ZERO), publisher="bag_player")
+        bench.run(0.05, v=0.0)
+    assert bench.line.travelled_m == 0.0
+    assert bench.diagnosis("publishers")[0] == WARN
 
 
 def test_any_source_is_obeyed_only_if_the_parameter_says_so_and_two_are_warned_of() -> None:

@@ -61,6 +61,7 @@ def _add_play(verbs: Any) -> None:
     add("--remap", **_MANY, metavar="FROM:=TO", help="rename a topic; repeatable")
     text = "publish commands and states even though a base is running: the robot may move"
     add("--force", action="store_true", help=text)
+    add("--no-clock", action="store_true", help="do not publish /clock")
     add("--delay", **_SPAN, default=0.5, help="wait for subscribers to connect (default: 0.5)")
     add("--wait-for", **_MANY, metavar="NODE", help="start once this node subscribes; repeatable")
 

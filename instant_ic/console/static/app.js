@@ -166,6 +166,11 @@ function setScale(percent) {
   drive.setScale(value / 100);
 }
 
+function fullScreen() {
+  if (document.fullscreenElement) document.exitFullscreen();
+  else document.documentElement.requestFullscreen().catch((error) => hud.toast(`Full screen failed: ${error.message}`));
+}
+
 function help() {
   if (helpDialog.open) helpDialog.close();
   else helpDialog.showModal();
@@ -182,6 +187,8 @@ const SHORTCUTS = {
   KeyM: () => screen.enlargeMap(),
   KeyR: () => recording.toggle(),
   KeyB: () => recording.mark(),
+  KeyP: () => screen.save(),
+  KeyF: fullScreen,
   KeyH: help,
   KeyV: glide,
   Minus: slower, NumpadSubtract: slower,
@@ -197,10 +204,14 @@ window.addEventListener("keydown", (event) => {
 const CLICKS = {
   take: () => lease.takeOver(),
   yield: () => lease.handOver(),
+  compass: () => look.centre(),
   "map-size": SHORTCUTS.KeyM,
   "map-canvas": SHORTCUTS.KeyM,
+  fullscreen: fullScreen,
+  "fullscreen-more": fullScreen,
   "help-open": help,
   "help-more": help,
+  "save-view": SHORTCUTS.KeyP,
 };
 for (const [id, action] of Object.entries(CLICKS)) byId(id).addEventListener("click", action);
 for (const button of document.querySelectorAll("#more button")) {

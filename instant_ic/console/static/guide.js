@@ -1,10 +1,12 @@
 // @ts-check
-// The predicted trajectory as a ribbon on the floor.
+// The predicted trajectory as a ribbon on the floor, and the compass tape.
 
 /** @import { Mat3, Vec3 } from "./math.js" */
 import { context2d } from "./dom.js";
-import { rotate, wrapAngle } from "./math.js";
+import { degrees, rotate, wrapAngle } from "./math.js";
 
+/** @type {Record<number, string>} Degrees to the right. */
+const NAMES = { 0: "AHEAD", 90: "RIGHT", "-90": "LEFT", "-180": "BEHIND" };
 const NEAREST_M = 0.25;
 const REACH_M = 4; // the nearby floor is out of view, so the arc is extended to here
 const STEP_M = 0.1;
@@ -117,4 +119,35 @@ function projected(trajectory, camera, tanHalf, halfWidth) {
     }
   }
   return left.length < 2 ? null : { left, right };
+}
+
+/**
+ * Renders a tape of directions relative to the robot: 0 is straight ahead.
+ * @param {HTMLCanvasElement} canvas @param {number} lookYaw @param {string} colour
+ */
+export function drawCompass(canvas, lookYaw, colour) {
+  const context = context2d(canvas);
+  const { width, height } = canvas, ratio = devicePixelRatio;
+  context.clearRect(0, 0, width, height);
+  const perDegree = width / 150, look = -degrees(lookYaw); // right is positive on the tape
+  context.textAlign = "center";
+  context.font = `600 ${11 * ratio}px system-ui, sans-serif`;
+  for (let mark = -180; mark < 180; mark += 15) {
+    const x = width / 2 + degrees(wrapAngle(((mark - look) * Math.PI) / 180)) * perDegree;
+    if (x < 0 || x > width) continue;
+    const side = Math.abs(x - width / 2) / (width / 2);
+    context.globalAlpha = 1 - side ** 2;
+    context.fillStyle = mark === 0 ? colour : "#a3adb8";
+    const name = NAMES[mark];
+    context.fillRect(x - ratio / 2, height - (mark % 45 ? 7 : 12) * ratio, ratio, (mark % 45 ? 7 : 12) * ratio);
+    if (name) context.fillText(name, x, 18 * ratio);
+    else if (mark % 45 === 0) context.fillText(`${Math.abs(mark)}°`, x, 18 * ratio);
+  }
+  context.globalAlpha = 1;
+  context.fillStyle = "#fff";
+  context.beginPath();
+  context.moveTo(width / 2, height - 9 * ratio);
+  context.lineTo(width / 2 - 5 * ratio, height);
+  context.lineTo(width / 2 + 5 * ratio, height);
+  context.fill();
 }

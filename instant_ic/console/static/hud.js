@@ -8,6 +8,7 @@
 /** @import { Health, State } from "./messages.js" */
 import { byId, mark, write } from "./dom.js";
 import { degrees } from "./math.js";
+import { PANORAMA, VIEW } from "./messages.js";
 import * as texts from "./texts.js";
 
 const ANNOUNCE_MS = 400;
@@ -32,14 +33,18 @@ export function showLatency(link, images) {
     element.className = shown === null ? "" : shown > bad ? "bad" : shown > warn ? "warn" : "";
   };
   const ms = texts.millisecondsText;
-  put("link-ms", link.roundTripMs, ms, 80, 200);
+  put("link-ms", link.roundTripMs, (value) => ms(value) + (link.quality ? ` · ${link.quality}` : ""), 80, 200);
+  mark("linkQuality", link.quality ?? "none");
   put("image-ms", images.ageMs(), ms, 400, 1000);
   put("camera-ms", images.blend < 1 ? images.cameraMs : null, ms, 400, 1000);
-  put("command-ms", link.commandAgeMs, ms, 80, 200);
+  const rate = link.commandHz ? ` · ${Math.round(link.commandHz)} /s` : "";
+  put("command-ms", link.commandAgeMs, (value) => ms(value) + rate, 80, 200);
+  const camera = images.rate(PANORAMA), view = images.rate(VIEW);
+  write(byId("rates"), camera || view ? `${camera.toFixed(0)} · ${view.toFixed(0)} /s` : "–");
 }
 
 /** @param {Health} health */
-export function showHealth({ vspace, battery, faults, pace }) {
+export function showHealth({ vspace, battery, faults, nodes, pace }) {
   byId("vspace-dot").dataset.state = vspace?.state ?? "empty";
   write(byId("vspace-text"), texts.vspaceText(vspace));
   write(byId("vspace-more"), texts.vspaceQuality(vspace));
@@ -50,17 +55,34 @@ export function showHealth({ vspace, battery, faults, pace }) {
     const share = battery.percent === null ? "" : ` · ${Math.round(battery.percent)} %`;
     write(byId("battery"), `${battery.voltage.toFixed(1)} V${share}`);
   }
-  const list = byId("faults"), key = JSON.stringify(faults);
-  if (list.dataset.key === key) return; // screen readers would repeat it
-  list.dataset.key = key;
-  list.replaceChildren(...faults.map(({ level, name, text }) => {
+  const total = nodes.reduce((sum, node) => sum + node.cpu_percent, 0);
+  write(byId("cpu"), nodes.length ? `${Math.round(total)} %` : "–");
+  replaceLines(byId("cpu-list"), nodes.map(texts.cpuText));
+  replaceItems(byId("faults"), faults, ({ level, name, text }) => {
     const item = document.createElement("li"), bold = document.createElement("b");
     item.className = level;
     item.title = `${name}: ${text}`; // full text, with the node's name for `ic log`
     bold.textContent = texts.nodeText(name);
     item.append(bold, ` ${text}`);
     return item;
-  }));
+  });
+}
+
+/**
+ * Fills a list, unless its entries are the same as before.
+ * @template T
+ * @param {HTMLElement} element @param {T[]} entries @param {(entry: T) => HTMLElement} item
+ */
+function replaceItems(element, entries, item) {
+  const key = JSON.stringify(entries);
+  if (element.dataset.key === key) return;
+  element.dataset.key = key;
+  element.replaceChildren(...entries.map(item));
+}
+
+/** Fills a list with lines of text. @param {HTMLElement} element @param {string[]} lines */
+export function replaceLines(element, lines) {
+  replaceItems(element, lines, (line) => Object.assign(document.createElement("li"), { textContent: line }));
 }
 
 /** @param {Drive} drive */

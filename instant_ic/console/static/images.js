@@ -60,6 +60,7 @@ export class Images {
     /** @type {Map<string, Surface>} Loaded surfaces, by id. */
     this._held = new Map();
     this._loads = 0; // counts loads, so that a late one of a lost link is dropped
+    this.framesPerSecond = 0; // of what this page renders
     /** @type {number | null} Time from the capture of a camera image to the end of its first rendering. */
     this.cameraMs = null;
     /** @type {PanoramaHeader | null} The camera image of the frame that is being rendered. */
@@ -85,6 +86,8 @@ export class Images {
     this._toward = 0;
     this._colours = { [PANORAMA]: new Releasing(), [VIEW]: new Releasing() };
     this._colouredAt = 0;
+    /** @type {Record<Kind, number[]>} */
+    this._arrivals = { [PANORAMA]: [], [VIEW]: [] };
   }
 
   /** @param {Settings} settings */
@@ -113,6 +116,9 @@ export class Images {
       }
       bitmap.close();
       this.changed = true;
+      const arrivals = this._arrivals[frame.kind];
+      arrivals.push(performance.now());
+      if (arrivals.length > 30) arrivals.shift();
     } catch (error) {
       console.warn(`image ${frame.sequence} of kind ${frame.kind}: ${error}`);
     } finally {
@@ -159,6 +165,15 @@ export class Images {
   /** True if the layers take the place of rendered views. */
   get rendersLayers() {
     return this.layers !== null && !this.viewer.lost;
+  }
+
+  /** Images of a kind per second, over the last 3 s. @param {Kind} kind */
+  rate(kind) {
+    if (kind === VIEW && this.rendersLayers) return this.framesPerSecond;
+    const now = performance.now();
+    const recent = this._arrivals[kind].filter((t) => now - t < 3000);
+    if (recent.length < 2) return 0;
+    return (1000 * (recent.length - 1)) / (now - recent[0]);
   }
 
   /** Notes that a frame with the newest images is being rendered. */

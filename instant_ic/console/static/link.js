@@ -21,6 +21,7 @@ export class Link extends EventTarget {
     this.clock = new ServerClock();
     /** @type {number | null} Delay of the last drive command. */
     this.commandAgeMs = null;
+    this.commandHz = 0; // drive commands accepted in the last second
     this.connected = false;
     this.everConnected = false;
     /** @type {WebSocket | null} */
@@ -43,6 +44,11 @@ export class Link extends EventTarget {
 
   get roundTripMs() {
     return this.clock.roundTripMs;
+  }
+
+  /** Quality of the link: "good", "fair", "poor"; null if unknown. */
+  get quality() {
+    return this.connected ? this.clock.quality : null;
   }
 
   /** @param {{type: string, [field: string]: unknown}} message */
@@ -158,6 +164,7 @@ export class Link extends EventTarget {
   _pong(message) {
     this.clock.take(message.client_ms, message.server_ms, performance.now());
     this.commandAgeMs = message.command_age_ms;
+    this.commandHz = message.command_hz;
     if (this.connected) return;
     this.connected = this.everConnected = true;
     this.dispatchEvent(new Event("open"));

@@ -70,7 +70,7 @@ const hello = object({
   type: oneOf("hello"), max_linear: number, max_angular: number, may_drive: flag, page,
 });
 const pong = object({
-  type: oneOf("pong"), client_ms: number, server_ms: number, command_age_ms: optional(number),
+  type: oneOf("pong"), client_ms: number, server_ms: number, command_age_ms: optional(number), command_hz: number,
 });
 const session = object({
   type: oneOf("session"), driver: oneOf("you", "other", "none"), clients: number, estop: flag, door: optional(text),
@@ -103,6 +103,7 @@ const health = object({
   type: oneOf("health"),
   vspace: optional(vspace),
   battery: optional(object({ voltage: number, percent: optional(number) })),
+  nodes: list(object({ name: text, cpu_percent: number })),
   faults: list(object({ level: oneOf("warn", "error"), name: text, text })),
   pace: optional(text),
 });
@@ -114,6 +115,8 @@ const recording = object({
   path: optional(text),
   seconds: optional(number),
   bytes: optional(number),
+  free_bytes: optional(number),
+  cached_s: optional(number),
   notice: object({ number, text, level: text }),
 });
 const refused = object({

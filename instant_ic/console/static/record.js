@@ -5,14 +5,14 @@
 /** @import { RecordingStatus } from "./messages.js" */
 import { byId, mark, write } from "./dom.js";
 import { announce, toast } from "./hud.js";
-import { recorderText, recordText } from "./texts.js";
+import { bytesText, recorderText, recordText } from "./texts.js";
 
 const RUNNING = ["recording", "disk full", "paused"];
 
 /** @type {RecordingStatus} */
 const NO_ANSWER = {
   type: "recording", recorder: "missing", state: "none", text: "The recorder has not answered yet.",
-  notice: { number: 0, text: "", level: "ok" }, path: null, seconds: null, bytes: null,
+  notice: { number: 0, text: "", level: "ok" }, path: null, seconds: null, bytes: null, free_bytes: null, cached_s: null,
 };
 
 export class Recording {
@@ -45,7 +45,7 @@ export class Recording {
 
   /** Shows the recorder's status. @param {RecordingStatus} status */
   take(status) {
-    const { recorder, state, path, text, notice } = this._status = status;
+    const { recorder, state, path, text, free_bytes, cached_s, notice } = this._status = status;
     if (this._notice !== null && notice.number !== this._notice) toast(notice.text);
     this._notice = notice.number;
     if (document.body.dataset.recording !== state) announce(state === "recording" ? "Recording" : recorderText(state));
@@ -56,7 +56,8 @@ export class Recording {
     button.setAttribute("aria-disabled", String(recorder !== "ok" || !this.mayRecord));
     button.setAttribute("aria-label", this.running ? `Stop recording (${shown})` : shown);
     button.title = text || (this.running && path ? path : "Record the drive (R)");
-    write(byId("record-more"), text);
+    const room = free_bytes === null ? "" : ` · ${bytesText(free_bytes)} free on disk`;
+    write(byId("record-more"), cached_s === null ? text : `The last ${Math.round(cached_s)} s are in memory${room}`);
   }
 
   /** @param {{type: string, [field: string]: unknown}} message */

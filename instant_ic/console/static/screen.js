@@ -1,5 +1,5 @@
 // @ts-check
-// Renders main image, trajectory and map, each only if it has changed. Frames follow each other while something
+// Renders main image, trajectory, compass and map, each only if it has changed. Frames follow each other while something
 // moves; otherwise a message, an image or an input requests the next one.
 
 /** @import { Settings } from "./settings.js" */
@@ -11,11 +11,13 @@
 /** @import { Vec3 } from "./math.js" */
 /** @import { GlViewer } from "./viewer.js" */
 import { byId, elementOf, mark } from "./dom.js";
-import { drawGuide } from "./guide.js";
+import { FrameRate } from "./framerate.js";
+import { drawCompass, drawGuide } from "./guide.js";
 import { showLatency } from "./hud.js";
 import { shows } from "./images.js";
 import { radians, transpose } from "./math.js";
 import { MiniMap } from "./minimap.js";
+import { saveView } from "./save.js";
 import { DEFAULTS } from "./settings.js";
 
 const LOOK_MS = 100; // shortest interval between two look messages
@@ -45,6 +47,8 @@ export class Screen {
     /** @type {Settings} */
     this.settings = DEFAULTS;
     this._guide = elementOf("guide", HTMLCanvasElement);
+    this._compass = elementOf("compass-tape", HTMLCanvasElement);
+    this._rate = new FrameRate();
     this._frameAt = this._viewAt = this._steppedAt = performance.now();
     this._requested = this._wanted = false;
     this._timer = 0;
@@ -128,11 +132,14 @@ export class Screen {
     const scene = this.images.scene(this.state, this.look, tanHalf, elapsed);
     const moved = this._renderView(scene);
     this._reportShown();
+    this._rate.frame(now, moved);
     this._drawOverlay(scene, tanHalf);
     this._drawMap(tanHalf, now);
     if (now - this._latencyAt > LATENCY_MS) {
       this._latencyAt = now;
       showLatency(this.link, this.images);
+      this.images.framesPerSecond = this._rate.perSecond;
+      mark("fps", this._rate.perSecond.toFixed(1));
       mark("image", this.images.shown ? (this.images.stale ? "stale" : "live") : "none");
     }
     // For tests and debugging.
@@ -145,6 +152,14 @@ export class Screen {
     const large = this.minimap.large = byId("map").classList.toggle("large");
     byId("map-size").setAttribute("aria-label", large ? "Shrink the map" : "Enlarge the map");
     this.minimap.changed = true;
+    this.wake();
+  }
+
+  /** Saves the shown view as a file. */
+  save() {
+    const render = () => this.viewer.render(this.images.scene(this.state, this.look, this._tanHalf(), 0));
+    saveView(this.viewer.canvas, render);
+    this._viewKey = "";
     this.wake();
   }
 
@@ -197,15 +212,16 @@ export class Screen {
 
   /** @param {Scene} scene @param {[number, number]} tanHalf */
   _drawOverlay(scene, tanHalf) {
-    const position = this._cameraPosition(), colour = COLOURS[this.state?.mode ?? "none"];
+    const { look } = this, position = this._cameraPosition(), colour = COLOURS[this.state?.mode ?? "none"];
     const trajectory = position && this.link.connected ? this.plan.trajectory : [];
     // Without a trajectory nothing in the overlay can move.
     const place = trajectory.length && position ? rounded([...scene.mapFromLook, ...position], 3) + trajectory.join() : "";
-    const key = [place, colour, rounded(tanHalf, 3)].join();
-    if (key === this._guideKey) return;
+    const key = [place, colour, rounded([look.yaw, look.vfov, ...tanHalf], 3)].join();
+    if (!fit(this._compass) && key === this._guideKey) return;
     this._guideKey = key;
     const camera = { lookFromMap: transpose(scene.mapFromLook), position: position ?? [0, 0, 0] };
     drawGuide(this._guide, trajectory, camera, tanHalf, this.settings.footprint[1] / 2, colour);
+    drawCompass(this._compass, look.yaw, colour);
   }
 
   /** @param {[number, number]} tanHalf @param {number} now */

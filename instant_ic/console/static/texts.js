@@ -1,9 +1,10 @@
 // @ts-check
 // Texts of the overlay, chosen by codes: modes, node names and states. No logic depends on a text of the robot.
 
-/** @import { RecordingStatus, Session, State, Vspace } from "./messages.js" */
+/** @import { Health, RecordingStatus, Session, State, Vspace } from "./messages.js" */
 
 /** @typedef {State["mode"]} Mode */
+/** @typedef {Health["nodes"][number]} NodeCpu */
 
 /** @type {Record<Mode, [string, string]>} Name of a mode, and its usual reason. */
 const MODES = {
@@ -32,6 +33,9 @@ const NODES = {
 
 /** @param {string} node */
 export const nodeText = (node) => (Object.hasOwn(NODES, node) ? NODES[node] : node);
+
+/** CPU of a node, percent of one core. @param {NodeCpu} node */
+export const cpuText = (node) => `${node.name}: ${Math.round(node.cpu_percent)} %`;
 
 /** @param {string | null | undefined} text */
 const sentence = (text) => (text ? text[0].toUpperCase() + text.slice(1) : "");

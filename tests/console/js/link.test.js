@@ -25,7 +25,7 @@ const socket = () => sockets.at(-1);
 function answerPing(serverMs = 5000, delayMs = 20) {
   const sent = socket().sent.findLast((message) => message.type === "ping").client_ms;
   time.now = sent + delayMs;
-  socket().deliver({ type: "pong", client_ms: sent, server_ms: serverMs, command_age_ms: 7 });
+  socket().deliver({ type: "pong", client_ms: sent, server_ms: serverMs, command_age_ms: 7, command_hz: 20 });
 }
 
 function connect() {
@@ -40,7 +40,7 @@ test("a link is open after the first answer, not with the socket", () => {
   answerPing();
   assert.deepEqual(events, ["open"]);
   assert.equal(link.serverNow(), 5010); // half of 20 ms later
-  assert.deepEqual([link.roundTripMs, link.commandAgeMs], [20, 7]);
+  assert.deepEqual([link.roundTripMs, link.commandAgeMs, link.commandHz], [20, 7, 20]);
 });
 
 test("commands carry the server's time and increasing numbers", () => {

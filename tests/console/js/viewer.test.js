@@ -63,7 +63,7 @@ test("the shown pose runs on with the velocity and eases the other robot's offse
   close(motion.pose, [3, 0, 0]); // another place: a cut
 });
 
-test("the server's clock follows the fastest answer", () => {
+test("the server's clock follows the fastest answer, and the quality the slow ones", () => {
   const clock = new ServerClock();
   assert.equal(clock.at(0), null);
   clock.take(100, 1000, 300); // 200 ms: offset 1000 + 100 - 300
@@ -72,6 +72,13 @@ test("the server's clock follows the fastest answer", () => {
   clock.take(400, 1400, 600); // slow again: changes nothing
   assert.equal(clock.at(600), 1405);
   assert.equal(clock.roundTripMs, 200);
+  assert.equal(clock.quality, null);
+  for (let i = 0; i < 60; i++) clock.take(0, 0, 20);
+  assert.equal(clock.quality, "good");
+  for (let i = 0; i < 10; i++) clock.take(0, 0, 300);
+  assert.equal(clock.quality, "fair");
+  for (let i = 0; i < 40; i++) clock.take(0, 0, 500);
+  assert.equal(clock.quality, "poor");
   clock.reset();
   assert.equal(clock.at(0), null);
 });

@@ -1,0 +1,39 @@
+// @ts-check
+// Saves the view as a file on the operator's machine.
+
+import { toast } from "./hud.js";
+
+/**
+ * Saves the shown view without the overlay, at the window's full resolution. `render` renders it into the canvas.
+ * @param {HTMLCanvasElement} canvas @param {() => void} render
+ */
+export function saveView(canvas, render) {
+  const { width, height } = canvas;
+  canvas.width = Math.round(canvas.clientWidth * devicePixelRatio);
+  canvas.height = Math.round(canvas.clientHeight * devicePixelRatio);
+  render(); // WebGL discards the image after the task that rendered it
+  canvas.toBlob((blob) => {
+    if (blob) download(blob, `view_${stamp()}.png`);
+    else toast("Not saved: the browser could not encode the image.");
+  }, "image/png");
+  canvas.width = width;
+  canvas.height = height;
+  render();
+}
+
+/** @param {Blob} blob @param {string} name */
+function download(blob, name) {
+  const link = document.createElement("a");
+  link.href = URL.createObjectURL(blob);
+  link.download = name;
+  link.click();
+  setTimeout(() => URL.revokeObjectURL(link.href), 10_000);
+  toast(`Saved: ${name}`);
+}
+
+function stamp() {
+  /** @param {number} value */
+  const two = (value) => String(value).padStart(2, "0");
+  const now = new Date(), day = `${now.getFullYear()}${two(now.getMonth() + 1)}${two(now.getDate())}`;
+  return `${day}_${two(now.getHours())}${two(now.getMinutes())}${two(now.getSeconds())}`;
+}
