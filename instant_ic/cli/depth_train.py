@@ -133,8 +133,8 @@ def _start(args: argparse.Namespace, network: CompletionConfig) -> tuple[Complet
     """Return the network with its first weights, and their origin for the record."""
     import torch
 
+    from instant_ic.training.checkpoints import CheckpointError, read_checkpoint
     from instant_ic.training.completion import CompletionNet, load_completion, load_encoder
-    from instant_ic.training.slicenet import CheckpointError, read_checkpoint
 
     torch.manual_seed(args.seed)
     if args.init:

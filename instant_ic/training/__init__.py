@@ -1,1 +1,1 @@
-"""Training of the depth network: data, augmentation, losses, SliceNet in torch, export to ONNX."""
+"""Training of the depth network: data, augmentation, losses, the completion network, export to ONNX."""

@@ -23,7 +23,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from instant_ic.training.slicenet import CheckpointError, load_state, read_checkpoint
+from instant_ic.training.checkpoints import CheckpointError, load_state, read_checkpoint
 
 GEOMETRY_CHANNELS = 8
 MIN_DEPTH_M, MAX_DEPTH_M = 0.1, 40.0

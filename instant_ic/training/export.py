@@ -1,4 +1,4 @@
-"""Export of SliceNet and the completion network to ONNX with manifest and training record (torch and onnx)."""
+"""Export of the completion network to ONNX with manifest and training record (torch and onnx)."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import hashlib
 import json
 import tempfile
 import warnings
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +16,6 @@ from numpy.typing import NDArray
 from instant_ic.depth.completion import PRIOR_CHANNELS
 from instant_ic.depth.manifest import ModelManifest, manifest_path, save_manifest
 from instant_ic.training.completion import CompletionNet
-from instant_ic.training.slicenet import SliceNet
 from instant_ic.util.files import replacing
 
 OPSET = 17
@@ -31,12 +29,7 @@ class ExportError(RuntimeError):
     """The exported file's output differs from the network's."""
 
 
-def export_onnx(
-    model: SliceNet | CompletionNet,
-    path: str | Path,
-    half_weights: bool = False,
-    report: Callable[[str], None] = lambda line: None,
-) -> dict[str, float]:
+def export_onnx(model: CompletionNet, path: str | Path, half_weights: bool = False) -> dict[str, float]:
     """Export the network as ONNX of fixed shape and compare it with torch on a random image.
 
     Batch norms are folded into the convolutions before them.
@@ -45,7 +38,6 @@ def export_onnx(
         model: the network; switched to evaluation mode.
         path: file to write; replaced only after all checks have passed.
         half_weights: store the weights as float16 (half the size); inference computes in float32.
-        report: receives a line before each step that takes time.
 
     Returns:
         ``difference``: largest |onnx - torch| over the largest |torch|, with float32 weights; ``half_difference``: the
@@ -58,54 +50,41 @@ def export_onnx(
     path = Path(path)
     model.eval()
     inputs = _example(model)
-    report("running the network in torch")
     with torch.inference_mode():
-        expected = _depth(model(*inputs.values()))
+        expected = model(*inputs.values())[0].numpy()
     if not np.isfinite(expected).all() or not np.ptp(expected):
         raise ExportError("the network outputs no depth: all pixels have the same value, or none")
     with tempfile.TemporaryDirectory() as folder:
         plain = Path(folder) / "model.onnx"
-        report("exporting to ONNX")
         with warnings.catch_warnings():
-            # The tracing exporter is the fast one here; its successor handles the LSTM no better.
+            # The tracing exporter is the fast one here.
             warnings.simplefilter("ignore")
             torch.onnx.export(
                 model, tuple(inputs.values()), str(plain), dynamo=False, opset_version=OPSET,
-                input_names=list(inputs), output_names=["depth", "sigma"][: len(inputs)],
+                input_names=list(inputs), output_names=["depth", "sigma"],
             )  # fmt: skip
-        report("running the network in onnxruntime")
         result = {"difference": _difference(_run(plain, inputs), expected)}
-        text = f"largest difference to torch: {result['difference']:.1e} of the largest depth"
         if not result["difference"] < MAX_RELATIVE_DIFFERENCE:
-            raise ExportError(text)
-        report(text)
+            raise ExportError(f"largest difference to torch: {result['difference']:.1e} of the largest depth")
         if half_weights:
-            report("converting the weights to float16 and running again")
             plain.write_bytes(_halve_weights(plain.read_bytes()))
             result["half_difference"] = _difference(_run(plain, inputs), expected)
             if not result["half_difference"] < MAX_HALF_DIFFERENCE:
                 raise ExportError(f"float16 weights change the depth by {result['half_difference']:.1e}")
-            report(f"float16 weights change the depth by {result['half_difference']:.1e}")
         with replacing(path) as file:
             file.write(plain.read_bytes())
     return result
 
 
-def _example(model: SliceNet | CompletionNet) -> dict[str, torch.Tensor]:
-    """Return inputs by name: a random image, and for a completion a random prior with some measured pixels."""
+def _example(model: CompletionNet) -> dict[str, torch.Tensor]:
+    """Return inputs by name: a random image, and a random prior with some measured pixels."""
     height, width = model.config.height, model.config.width
     generator = torch.Generator().manual_seed(1)
-    inputs = {"image": torch.rand((1, 3, height, width), generator=generator)}
-    if isinstance(model, CompletionNet):
-        prior = torch.rand((1, PRIOR_CHANNELS, height, width), generator=generator)
-        prior[:, 0] = 4 * prior[:, 0] * (prior[:, 1] > 0.3)
-        prior[:, 2] = ((prior[:, 2] > 0.95) & (prior[:, 0] > 0)).float()
-        inputs["prior"] = prior
-    return inputs
-
-
-def _depth(output: torch.Tensor | tuple[torch.Tensor, torch.Tensor]) -> NDArray[np.floating]:
-    return (output[0] if isinstance(output, tuple) else output).numpy()
+    image = torch.rand((1, 3, height, width), generator=generator)
+    prior = torch.rand((1, PRIOR_CHANNELS, height, width), generator=generator)
+    prior[:, 0] = 4 * prior[:, 0] * (prior[:, 1] > 0.3)
+    prior[:, 2] = ((prior[:, 2] > 0.95) & (prior[:, 0] > 0)).float()
+    return {"image": image, "prior": prior}
 
 
 def _run(path: Path, inputs: dict[str, torch.Tensor]) -> NDArray[np.float32]:
@@ -143,7 +122,7 @@ def _halve_weights(content: bytes) -> bytes:
 
 
 def export_model(
-    model: SliceNet | CompletionNet,
+    model: CompletionNet,
     path: str | Path,
     name: str,
     licence: str,
@@ -151,7 +130,6 @@ def export_model(
     record: dict[str, Any] | None = None,
     half_weights: bool = False,
     brightness: float = 0.0,
-    report: Callable[[str], None] = lambda line: None,
 ) -> ModelManifest:
     """Write ``NAME.onnx``, its manifest ``NAME.yaml`` and, if given, the training record ``NAME.json``.
 
@@ -161,7 +139,7 @@ def export_model(
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    differences = export_onnx(model, path, half_weights, report)
+    differences = export_onnx(model, path, half_weights)
     manifest = ModelManifest(
         model=path.name,
         name=name,
@@ -170,8 +148,8 @@ def export_model(
         input_width=model.config.width,
         brightness=brightness,
         max_range_m=max_range_m,
-        prior_input="prior" if isinstance(model, CompletionNet) else "",
-        sigma_output="sigma" if isinstance(model, CompletionNet) else "",
+        prior_input="prior",
+        sigma_output="sigma",
         sha256=hashlib.sha256(path.read_bytes()).hexdigest(),
     )
     save_manifest(manifest, manifest_path(path))

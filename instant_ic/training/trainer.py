@@ -23,12 +23,12 @@ from torch import Tensor, nn
 
 from instant_ic.depth.metrics import DepthMetrics, depth_metrics, mean_metrics, solid_angle_weights
 from instant_ic.training.augment import photograph, to_brightness, turn_and_mirror, without_lidar
+from instant_ic.training.checkpoints import CheckpointError, read_checkpoint
 from instant_ic.training.completion import CompletionNet
 from instant_ic.training.dataset import Sample
 from instant_ic.training.feeds import Batch, Feed, stack
 from instant_ic.training.log import TrainingLog
 from instant_ic.training.losses import depth_loss, edge_loss, sigma_loss
-from instant_ic.training.slicenet import CheckpointError, read_checkpoint
 from instant_ic.util.files import replacing
 
 POLE_WEIGHT = 0.1

@@ -6,12 +6,14 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+import tiny_onnx
 import torch
 
 from instant_ic.bus import Node, NodeError
 from instant_ic.bus.lockstep import LockstepBus
 from instant_ic.depth.keyframes import KeyframeSelectionConfig, KeyframeSelector, decode_sigma, encode_sigma
 from instant_ic.depth.lidar_depth import LidarDepthConfig
+from instant_ic.depth.manifest import ModelManifest, manifest_path, save_manifest
 from instant_ic.depth.scaler import ScalerConfig
 from instant_ic.geometry.poses import inverse, pose_matrix
 from instant_ic.geometry.projections import equirect_directions
@@ -32,7 +34,6 @@ from instant_ic.msg import (
 )
 from instant_ic.training.completion import CompletionConfig, CompletionNet
 from instant_ic.training.export import export_model
-from instant_ic.training.slicenet import SliceNet, SliceNetConfig
 from nodes.depth_estimator import DepthEstimatorConfig, DepthEstimatorNode
 from nodes.depth_scaler import DepthScalerConfig, DepthScalerNode
 
@@ -88,12 +89,11 @@ def jpeg(seed: int, height: int = 64) -> bytes:
 
 @pytest.fixture(scope="module")
 def model_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    torch.manual_seed(0)
-    config = SliceNetConfig(
-        backbone="resnet18", height=64, width_multiplier=0.125, lstm_hidden=8, column_stride=2, decoder_floor=8
-    )
+    """A network whose depth is the red channel as it comes in."""
     path = tmp_path_factory.mktemp("model") / "tiny.onnx"
-    export_model(SliceNet(config), path, "tiny", "Apache-2.0", 16.0)
+    nodes = tiny_onnx.channel("image", 0, "depth")
+    tiny_onnx.write(path, {"image": (1, 3, 64, 128)}, {"depth": (1, 1, 64, 128)}, nodes, tiny_onnx.CHANNELS)
+    save_manifest(ModelManifest("tiny.onnx", "tiny", "Apache-2.0", 64, 128), manifest_path(path))
     return path
 
 

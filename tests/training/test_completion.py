@@ -1,16 +1,17 @@
 """The completion network: it starts as its prior, keeps measured pixels, and is the same on a turned panorama."""
 
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
 
 from instant_ic.depth.model import DepthModel
+from instant_ic.training.checkpoints import CheckpointError
 from instant_ic.training.completion import CompletionConfig, CompletionNet, load_encoder
-from instant_ic.training.export import export_model
+from instant_ic.training.export import ExportError, export_model
 from instant_ic.training.losses import sigma_loss
-from instant_ic.training.slicenet import CheckpointError
 
 TINY = CompletionConfig(64, (8, 8, 8), 2)
 
@@ -128,3 +129,16 @@ def test_sigma_loss_is_smallest_where_68_percent_lie_within() -> None:
     losses = [sigma_loss(truth * error.exp(), torch.full_like(truth, float(s)), truth, rows) for s in tried]
     best = float(tried[int(np.argmin(losses))])
     assert (error.abs() < best).float().mean().item() == pytest.approx(0.68, abs=0.03)
+
+
+def test_a_file_that_differs_from_the_network_is_not_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "m.onnx"
+    path.write_bytes(b"the model before")
+    other = np.zeros((1, 64, 128), np.float32)
+    monkeypatch.setattr(torch.onnx, "export", lambda model, inputs, path, **options: Path(path).write_bytes(b"file"))
+    monkeypatch.setattr(
+        "onnxruntime.InferenceSession", lambda *args, **options: SimpleNamespace(run=lambda *_: [other])
+    )
+    with pytest.raises(ExportError, match="difference to torch"):
+        export_model(trained(), path, "m", "Apache-2.0", 40.0)
+    assert path.read_bytes() == b"the model before" and list(tmp_path.iterdir()) == [path]

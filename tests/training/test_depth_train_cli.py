@@ -13,9 +13,9 @@ import torch
 
 from instant_ic.cli import depth_train
 from instant_ic.cli.errors import UserError
+from instant_ic.training.checkpoints import CheckpointError
 from instant_ic.training.dataset import DatasetError, save_sample
 from instant_ic.training.rooms import RoomsConfig
-from instant_ic.training.slicenet import CheckpointError
 
 
 def ic(*words: str) -> int:

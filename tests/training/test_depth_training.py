@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 import torch
 
+from instant_ic.training.checkpoints import CheckpointError
 from instant_ic.training.completion import CompletionConfig, CompletionNet, load_completion
 from instant_ic.training.dataset import Sample
 from instant_ic.training.feeds import Feed
-from instant_ic.training.slicenet import CheckpointError
 from instant_ic.training.trainer import (
     Trainer,
     TrainingConfig,

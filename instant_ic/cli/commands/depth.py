@@ -1,4 +1,4 @@
-"""``ic depth``: train, convert and run depth models."""
+"""``ic depth``: train and run depth models."""
 
 from __future__ import annotations
 
@@ -9,9 +9,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from instant_ic.cli import depth_train
-from instant_ic.cli.arguments import group, positive, positive_int, verb
+from instant_ic.cli.arguments import group, positive_int, verb
 from instant_ic.cli.errors import UserError
-from instant_ic.cli.evaluations import errors_for_the_user
 
 if TYPE_CHECKING:
     from instant_ic.depth.model import DepthModel
@@ -21,8 +20,8 @@ PROVIDERS = ("auto", "tensorrt", "cuda", "cpu")
 
 def add_parser(subparsers: Any) -> None:
     commands = group(
-        subparsers, "depth", "train, convert and run 360° depth models",
-        "Train, convert and run 360° depth models (docs/depth.md).",
+        subparsers, "depth", "train and run 360° depth models",
+        "Train and run 360° depth models (docs/depth.md).",
         "ic depth estimate panorama.jpg --output depth.png",
     )  # fmt: skip
     depth_train.add_parser(commands)
@@ -36,20 +35,6 @@ def add_parser(subparsers: Any) -> None:
     ).add_argument  # fmt: skip
     add("wheel", type=Path, help="the wheel")
     add("-o", "--output", type=Path, default=Path("runs/textures"), help="folder (%(default)s)")
-    add = verb(
-        commands, "convert", "convert SliceNet weights to ONNX with a manifest", convert,
-        "ic depth convert resnet50_m3d.pth -o slicenet_m3d.onnx",
-        "Convert a checkpoint (published SliceNet weights, or ours) to ONNX with its manifest, and compare "
-        "the output of ONNX with that of torch. Nothing is written if they differ.",
-    ).add_argument  # fmt: skip
-    add("weights", type=Path, help="checkpoint file")
-    add("-o", "--output", type=Path, help="ONNX file to write (default: WEIGHTS.onnx)")
-    add("--half", action="store_true", help="store the weights as float16, half the size")
-    text = "mean byte value of the training images, 0 for any (%(default)s)"
-    add("--brightness", type=float, default=0.0, metavar="BYTE", help=text)
-    add("--max-range", type=positive, default=16.0, metavar="M", help="longest range in metres (%(default)s)")
-    add("--name", help="name in the manifest (default: the file's name)")
-    add("--licence", help="licence in the manifest (default: unknown; Apache-2.0 for our own)")
     add = verb(
         commands, "estimate", "estimate the depth of one panorama as a coloured image", estimate,
         "ic depth estimate panorama.jpg --output depth.png --npy depth.npy",
@@ -67,37 +52,6 @@ def textures(args: argparse.Namespace) -> int:
     from instant_ic.training.photographs import unpack
 
     print(f"wrote {unpack(args.wheel, args.output)} textures to {args.output}")
-    return 0
-
-
-def convert(args: argparse.Namespace) -> int:
-    import torch
-
-    from instant_ic.training.export import export_model
-    from instant_ic.training.slicenet import load_checkpoint
-
-    output = args.output or args.weights.with_suffix(".onnx")
-    if output.suffix != ".onnx":
-        raise UserError(
-            f"{output}: the name must end in .onnx; its manifest becomes {output.with_suffix('.yaml').name}"
-        )
-    begin = time.monotonic()
-
-    def report(line: str) -> None:
-        print(f"{time.monotonic() - begin:5.1f} s  {line}", flush=True)
-
-    report(f"reading {args.weights}")
-    with errors_for_the_user():
-        model = load_checkpoint(args.weights)
-        own = torch.load(args.weights, map_location="cpu", weights_only=True)
-        count = sum(parameter.numel() for parameter in model.parameters())
-        report(f"SliceNet {model.config.backbone}, {model.config.width} x {model.config.height}, {count / 1e6:.1f} M")
-        licence = args.licence or ("Apache-2.0" if "config" in own else "unknown: ask the authors of the weights")
-        export_model(
-            model, output, args.name or output.stem, licence, args.max_range, own.get("record"), args.half,
-            args.brightness, report,
-        )  # fmt: skip
-    report(f"wrote {output} ({output.stat().st_size / 1e6:.1f} MB) and {output.with_suffix('.yaml').name}")
     return 0
 
 
