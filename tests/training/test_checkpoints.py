@@ -33,7 +33,7 @@ def test_damage_anywhere_is_seen(tmp_path: Path) -> None:
     torch.save({"weight": torch.rand(10_000)}, path)
     whole = path.read_bytes()
     path.write_bytes(whole[: len(whole) // 2])
-    with pytest.raises(CheckpointError, match="damaged|cannot be read"):
+    with pytest.raises(CheckpointError, match=r"damaged|cannot be read"):
         read_checkpoint(path)
     flipped = bytearray(whole)
     flipped[len(whole) // 2] ^= 1  # one bit of a weight
