@@ -180,25 +180,6 @@ def sector_factors(
     return centres, smooth
 
 
-def solid_angle_quantile(depth: Floats, confidence: float) -> float:
-    """Quantile of the known depth of an equirect image (H, W), each pixel counted by its solid angle.
-
-    Raises:
-        ScaleError: fewer than ``MIN_VALUES`` known pixels.
-    """
-    height, width = depth.shape
-    elevation = np.pi / 2 - (np.arange(height) + 0.5) * (np.pi / height)
-    weights = np.broadcast_to(np.cos(elevation)[:, None], (height, width))
-    known = np.isfinite(depth) & (depth > 0)
-    if int(known.sum()) < MIN_VALUES:
-        raise ScaleError(f"only {int(known.sum())} usable values of depth, {MIN_VALUES} are needed")
-    values, counts = depth[known], weights[known]
-    order = np.argsort(values, kind="stable")
-    total = np.cumsum(counts[order])
-    place = int(np.searchsorted(total, confidence * total[-1]))
-    return float(values[order[min(place, len(order) - 1)]])
-
-
 def _positive(values: Floats, name: str) -> Floats:
     usable = values[np.isfinite(values) & (values > 0)]
     if len(usable) < MIN_VALUES:

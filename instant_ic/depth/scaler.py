@@ -17,12 +17,10 @@ from instant_ic.depth.scale_rules import (
     max_ratio_scale,
     ransac_line,
     sector_factors,
-    solid_angle_quantile,
 )
 from instant_ic.depth.visibility import azimuth_problem, hidden, nearest_points, on_depth_edge
 
 METHODS = ("max_ratio", "ransac", "sector", "as_estimated")
-MAXIMA = ("lidar", "image")
 OUTPUT_KINDS = ("metric", "scale_invariant", "relative", "disparity")
 """``metric``: metres. ``scale_invariant``: metres up to one factor. ``relative``: metres up to factor and shift.
 ``disparity``: inverse metres up to factor and shift."""
@@ -39,7 +37,6 @@ class ScalerConfig:
 
     Attributes:
         method: sector, ransac, max_ratio (the paper's), as_estimated (not for driving).
-        maxima: max_ratio's largest depth: over the LiDAR's directions (lidar) or the whole image (image).
         output_kind: kind of the model's output, as in its manifest: metric, scale_invariant, relative, disparity.
         min_range_m: metres from the camera; nearer points (the robot itself) are left out.
         max_range_m: metres; farther points are left out, farther depth is cut.
@@ -51,7 +48,6 @@ class ScalerConfig:
     """
 
     method: str = "sector"
-    maxima: str = "lidar"
     output_kind: str = "metric"
     min_range_m: NotNegative = 0.4
     max_range_m: Positive = 16.0
@@ -63,7 +59,7 @@ class ScalerConfig:
     assumed_sigma: Annotated[float, Range(above=0, high=1)] = 0.2
 
     def __post_init__(self) -> None:
-        for key, allowed in (("method", METHODS), ("maxima", MAXIMA), ("output_kind", OUTPUT_KINDS)):
+        for key, allowed in (("method", METHODS), ("output_kind", OUTPUT_KINDS)):
             if getattr(self, key) not in allowed:
                 raise ValueError(f"{key} must be one of {', '.join(allowed)} (got {getattr(self, key)!r})")
         check_ranges(self)
@@ -153,7 +149,7 @@ class DepthScaler:
             )
         rows, columns, range_m = rows[usable], columns[usable], range_m[usable]
         _check_azimuth(columns, depth.shape[1])
-        scale, shift = self._line(depth, depth[rows, columns], range_m)
+        scale, shift = self._line(depth[rows, columns], range_m)
         if scale <= 0:
             raise ScaleError(f"depth falls where the range grows (slope {scale:.3g})")
         metres = self._metres(depth, scale, shift)
@@ -188,7 +184,7 @@ class DepthScaler:
         _check_azimuth(columns, width)
         return rows, columns, range_m
 
-    def _line(self, depth: Floats, at_points: Floats, range_m: Floats) -> tuple[float, float]:
+    def _line(self, at_points: Floats, range_m: Floats) -> tuple[float, float]:
         """Scale and shift between the model's unit and metres (inverse metres for ``disparity``)."""
         config = self.config
         if config.output_kind == "relative":
@@ -197,9 +193,7 @@ class DepthScaler:
             return ransac_line(at_points, 1.0 / range_m, AGREEMENT / range_m)[:2]
         if config.method in ("ransac", "sector"):
             return consensus_scale(at_points, range_m, AGREEMENT).scale, 0.0
-        if config.maxima == "lidar":
-            return max_ratio_scale(at_points, range_m, _CONFIDENCE), 0.0
-        return float(np.quantile(range_m, _CONFIDENCE)) / solid_angle_quantile(depth, _CONFIDENCE), 0.0
+        return max_ratio_scale(at_points, range_m, _CONFIDENCE), 0.0
 
     def _metres(self, depth: Floats, scale: float, shift: float) -> NDArray[np.float64]:
         """Depth (H, W) in metres, not finite where it is unknown."""

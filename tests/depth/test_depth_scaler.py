@@ -12,7 +12,6 @@ from instant_ic.depth.scale_rules import (
     max_ratio_scale,
     ransac_line,
     sector_factors,
-    solid_angle_quantile,
 )
 from instant_ic.depth.scaler import DepthScaler, ScalerConfig
 from instant_ic.depth.visibility import hidden, on_depth_edge, pixels_of
@@ -61,15 +60,6 @@ def test_projection_by_hand() -> None:
     rows, columns, range_m = pixels_of(points, 8, 4)
     assert columns[:3].tolist() == [4, 2, 6] and rows.tolist() == [2, 2, 2, 0]
     np.testing.assert_allclose(range_m, [2, 3, 1, 4])
-
-
-def test_quantile_by_solid_angle() -> None:
-    # Two rows at 60 degrees weigh cos 60 = 1/2 against those near the horizon; by hand for 3 rows (60, 0, -60):
-    # weights 1/2, 1, 1/2 for depths 1, 2, 3: cumulated 1/4, 3/4, 1.
-    depth = np.repeat([[1.0], [2.0], [3.0]], 12, axis=1)
-    assert solid_angle_quantile(depth, 0.2) == 1.0
-    assert solid_angle_quantile(depth, 0.5) == 2.0
-    assert solid_angle_quantile(depth, 0.8) == 3.0
 
 
 def test_line_by_ransac_is_exact_under_forty_percent_of_outliers() -> None:
@@ -208,15 +198,6 @@ def test_points_on_edges_of_the_depth_are_found() -> None:
     depth[2, 4] = 0.0  # unknown is no edge
     columns = np.arange(8)
     np.testing.assert_array_equal(on_depth_edge(depth, np.full(8, 2), columns), np.isin(columns, (7, 0, 1)))
-
-
-def test_maximum_of_the_image_counts_what_the_lidar_cannot_see() -> None:
-    depth = room_depth()
-    depth[:16] = 50.0  # a high ceiling, far above the LiDAR's 15 degrees
-    assert DepthScaler(ScalerConfig("max_ratio", "lidar")).fit(depth, room_points()).scale == pytest.approx(
-        1.0, rel=0.03
-    )
-    assert DepthScaler(ScalerConfig("max_ratio", "image")).fit(depth, room_points()).scale < 0.2
 
 
 def test_relative_depth_gets_scale_and_shift() -> None:
