@@ -4,11 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from types import SimpleNamespace
+from typing import TYPE_CHECKING, NoReturn
 
 import yaml
 
 from instant_ic.bag.message import BagError
 from instant_ic.config.yaml_text import compose_yaml
+
+if TYPE_CHECKING:
+    import apsw
 
 MOST_CHUNK_BYTES = 256 << 20
 """Largest decompressed chunk or message. Recorders close chunks at about 1 MB, but a single message may be larger."""
@@ -48,24 +52,28 @@ def decompress(data: bytes | memoryview, compression: str, declared_bytes: int |
 
 
 def guard_rosbags() -> None:
-    """Add size limits to `rosbags`, which has none: MCAP chunks and YAML; other storage is refused.
+    """Add size limits to `rosbags`, which has none: MCAP chunks, messages, SQLite values, YAML.
 
     This replaces the decompressor tables and YAML readers of `rosbags`; a test checks that `rosbags` uses the
     replacements.
     """
+    import apsw
     from rosbags.rosbag2 import reader as ros2
-    from rosbags.rosbag2 import storage_mcap
+    from rosbags.rosbag2 import storage_mcap, storage_sqlite3
 
     from instant_ic.bag.metadata import profiles_of
 
     ros2.YAML = _BoundedYaml  # type: ignore[assignment,misc]
-    ros2.DirectoryReader.STORAGE_PLUGINS = {"mcap": storage_mcap.McapReader}
-    for module in (ros2, storage_mcap):
+    for module in (ros2, storage_mcap, storage_sqlite3):
         module.parse_qos = profiles_of  # type: ignore[attr-defined]
 
     storage_mcap.DECOMPRESSORS["lz4"] = lambda data, size: decompress(data, "lz4", size)
     storage_mcap.DECOMPRESSORS["zstd"] = lambda data, size: decompress(data, "zstd", size)
-    ros2.zstd = SimpleNamespace(open=lambda *_: refuse_compression("file"))  # type: ignore[assignment]
+    ros2.zstd = SimpleNamespace(  # type: ignore[assignment]
+        decompress=lambda data: decompress(data, "zstd"), open=_refuse_file
+    )
+    if _limit_schema not in apsw.connection_hooks:
+        apsw.connection_hooks.append(_limit_schema)
 
 
 class _BoundedYaml:
@@ -90,14 +98,19 @@ class _BoundedYaml:
         return self._yaml.load(text)
 
 
-def refuse_compression(mode: str | None) -> None:
-    """Refuse rosbag2's compression of whole files and single messages; chunks are compressed inside the MCAP file.
+def _limit_schema(connection: apsw.Connection) -> None:
+    """Limit what the schema of a database may compute, since it comes with the file."""
+    import apsw
 
-    Raises:
-        BagError: the bag has such compression.
-    """
-    if mode in ("file", "message"):
-        raise BagError(f"its {mode}s are compressed one by one; convert it: rosbags-convert --src BAG --dst NEW")
+    # A column may be computed: the 20 bytes of zeroblob(1000000000) yield a gigabyte.
+    connection.limit(apsw.SQLITE_LIMIT_LENGTH, MOST_CHUNK_BYTES)
+    # A view may have rows without end.
+    connection.config(apsw.SQLITE_DBCONFIG_ENABLE_VIEW, 0)
+
+
+def _refuse_file(stream: object, _mode: str) -> NoReturn:
+    name = getattr(stream, "name", "a file")
+    raise BagError(f"{name} is compressed as a whole; convert its bag first: rosbags-convert --src BAG --dst NEW")
 
 
 def _zstd(data: bytes) -> Iterator[bytes]:

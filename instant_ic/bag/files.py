@@ -1,4 +1,4 @@
-"""Reads bags as bytes, by `rosbags`: rosbag2 folders (MCAP) and bare ``.mcap`` files."""
+"""Reads bags as bytes, by `rosbags`: rosbag2 folders (MCAP and SQLite), bare ``.mcap`` and ``.db3`` files."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from typing import Any
 from rosbags.interfaces import Connection
 from rosbags.rosbag2 import Reader, ReaderError
 
-from instant_ic.bag.bounded import guard_rosbags, refuse_compression
+from instant_ic.bag.bounded import guard_rosbags
 from instant_ic.bag.mcap_writer import Schema
 from instant_ic.bag.message import BagError, BagMessage
 from instant_ic.bag.metadata import REPEATED, preset_of, schema_of, schema_or_unknown, store_of
@@ -53,7 +53,7 @@ class BagReader(Closing):
     Latched values that a recorder repeats at the start of each file are counted once and returned once.
 
     Args:
-        path: rosbag2 folder or ``.mcap`` file.
+        path: rosbag2 folder, ``.mcap`` or ``.db3`` file.
 
     Raises:
         BagError: there is no bag at the path, or the bag is truncated.
@@ -63,15 +63,12 @@ class BagReader(Closing):
         self.path = path
         if not path.exists():
             raise BagError(f"bag {path} does not exist")
-        if path.suffix in (".bag", ".db3") or any(path.glob("*.db3*")):
-            kind = "ROS 1" if path.suffix == ".bag" else "SQLite"
-            command = f"rosbags-convert --src {path} --dst {path.stem}_mcap --dst-storage mcap"
-            raise BagError(f"{path} is a {kind} bag; convert it first: {command}")
+        if path.suffix == ".bag":
+            raise BagError(f"{path} is a ROS 1 bag; convert it first: rosbags-convert --src {path} --dst {path.stem}")
         self._reader: Any
         try:
             self._reader = Reader(path)
             self._reader.open()
-            refuse_compression(self._reader.compression_mode)
         except FileNotFoundError:
             raise BagError(self._why_no_metadata()) from None
         except BagError:
@@ -166,7 +163,8 @@ class BagReader(Closing):
     @property
     def compression(self) -> str:
         """Compression of the messages: ``zstd``, ``lz4`` or empty."""
-        kinds = {chunk.compression for storage in self._storages for chunk in getattr(storage, "chunks", ())}
+        kinds = {str(self._reader.compression_format or "")}
+        kinds |= {chunk.compression for storage in self._storages for chunk in getattr(storage, "chunks", ())}
         return ", ".join(sorted(kinds - {""}))
 
     @property
@@ -268,6 +266,9 @@ class BagReader(Closing):
     def _raw(
         self, connections: list[Connection], start_ns: int | None, stop_ns: int | None
     ) -> Generator[tuple[Connection, int, bytes], None, None]:
+        if self._reader.compression_mode == "message":
+            yield from self._reader.messages(connections, start_ns, stop_ns)
+            return
         # Merge by stamp: files are not in stamp order where a clock was set back or files overlap.
         streams = [self._of_part(storage, connections, start_ns, stop_ns) for storage in self._storages]
         yield from streams[0] if len(streams) == 1 else heapq.merge(*streams, key=lambda entry: entry[1])

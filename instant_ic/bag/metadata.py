@@ -153,7 +153,7 @@ def store_of(schema: Schema) -> Any:
 @functools.lru_cache(maxsize=200)
 def with_hash(schema: Schema) -> Schema:
     """Add the RIHS01 hash of the definition. A missing definition is replaced by ours, a damaged one is emptied."""
-    if not schema.encoding or not schema.text:
+    if not schema.encoding or not schema.text:  # old SQLite bags store none
         return schema_or_unknown(schema.name)
     if schema.type_hash or schema.encoding != "ros2msg":
         return schema
@@ -194,7 +194,7 @@ def profiles_of(profiles: list[Any] | str) -> list[Qos]:
     """Return the profiles of a topic, for `rosbags`, whose own YAML parser takes milliseconds for each topic of a file.
 
     Args:
-        profiles: YAML, as MCAP files hold it, or what ``metadata.yaml`` holds.
+        profiles: YAML, as MCAP and SQLite files hold it, or what ``metadata.yaml`` holds.
 
     Raises:
         ReaderError: the text is not a list in YAML.

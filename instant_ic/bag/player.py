@@ -56,7 +56,7 @@ class BagPlayerConfig(PlayOptions):
     """Parameters of ``bag_player``, in addition to those of playing.
 
     Attributes:
-        bag: folder of the bag, or a ``.mcap`` file.
+        bag: folder of the bag, or a ``.mcap`` or ``.db3`` file.
         drop_transforms: child frames whose transforms are left out of ``/tf`` because another node broadcasts them.
         publish_clock: whether to publish ``/clock``.
         delay_s: seconds for which the time stands still at the start, so that subscribers find the topics.

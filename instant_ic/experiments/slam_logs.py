@@ -368,7 +368,7 @@ def read_mines(path: str | Path, bad: list[str] | None = None) -> Iterator[LogEn
 
 def is_bag(path: Path) -> bool:
     """Return whether a path looks like a bag: a folder, or a file with a bag's extension."""
-    return path.is_dir() or path.suffix == ".mcap"
+    return path.is_dir() or path.suffix in (".mcap", ".db3")
 
 
 def read_bag(path: Path, scan_topic: str | None = None) -> Iterator[LogEntry]:

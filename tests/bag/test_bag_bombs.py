@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import struct
 import tracemalloc
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -88,14 +88,30 @@ def test_chunk_never_unpacks_to_more_than_it_declares_or_than_the_limit(
         BagReader(path)
 
 
-def test_a_bag_of_another_writer_is_limited(
-    tmp_path: Path, small_limits: None, monkeypatch: pytest.MonkeyPatch
+def ros2_bag(mode: CompressionMode, storage: StoragePlugin) -> Callable[[Path], Path]:
+    def write(folder: Path) -> Path:
+        writer = Writer(folder / "bag", version=9, storage_plugin=storage)
+        writer.set_compression(mode, CompressionFormat.ZSTD)
+        with writer:
+            connection = writer.add_connection("/text", TEXT, typestore=typestore())
+            writer.write(connection, 1, bytes(BOMB))
+        return folder / "bag"
+
+    return write
+
+
+@pytest.mark.parametrize(
+    "write",
+    [
+        ros2_bag(CompressionMode.MESSAGE, StoragePlugin.SQLITE3),
+        ros2_bag(CompressionMode.STORAGE, StoragePlugin.MCAP),
+    ],
+    ids=["sqlite-message", "mcap"],
+)
+def test_every_kind_of_bag_is_limited(
+    tmp_path: Path, write: Callable[[Path], Path], small_limits: None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    path = tmp_path / "bag"
-    writer = Writer(path, version=9, storage_plugin=StoragePlugin.MCAP)
-    writer.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
-    with writer:
-        writer.write(writer.add_connection("/text", TEXT, typestore=typestore()), 1, bytes(BOMB))
+    path = write(tmp_path)
     with level_memory(), pytest.raises(BagError, match=r"more than|it declares"), BagReader(path) as bag:
         list(bag.messages())
     # Above the limit it is not the bag that is at fault.
@@ -103,6 +119,43 @@ def test_a_bag_of_another_writer_is_limited(
     with BagReader(path) as bag:
         assert bag.count == 1
         assert len(next(iter(bag.messages())).payload) >= BOMB - 8
+
+
+def test_computed_column_of_an_sqlite_bag_is_limited(tmp_path: Path, small_limits: None) -> None:
+    import sqlite3
+
+    path = ros2_bag(CompressionMode.NONE, StoragePlugin.SQLITE3)(tmp_path)
+    file = next(path.glob("*.db3"))
+    with sqlite3.connect(file) as database:
+        database.execute("DROP TABLE messages")
+        database.execute(
+            "CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id INTEGER, timestamp INTEGER, "
+            f"data BLOB GENERATED ALWAYS AS (zeroblob({BOMB})) VIRTUAL)"
+        )
+        database.execute("INSERT INTO messages(topic_id, timestamp) VALUES (1, 1)")
+    database.close()
+    with level_memory(), pytest.raises(BagError, match="too big"), BagReader(path) as bag:
+        list(bag.messages())
+
+
+@pytest.mark.timeout(300)
+def test_sqlite_table_that_is_a_view_without_end_is_not_read(tmp_path: Path) -> None:
+    import sqlite3
+
+    path = ros2_bag(CompressionMode.NONE, StoragePlugin.SQLITE3)(tmp_path)
+    file = next(path.glob("*.db3"))
+    with sqlite3.connect(file) as database:
+        database.execute("DROP TABLE messages")
+        database.execute(
+            "CREATE VIEW messages AS WITH RECURSIVE n(id) AS (SELECT 1 UNION ALL SELECT id + 1 FROM n) "
+            "SELECT id, 1 AS topic_id, id AS timestamp, x'00' AS data FROM n"
+        )
+        # rosbags counts what the schema calls tables.
+        database.execute("PRAGMA writable_schema = ON")
+        database.execute("UPDATE sqlite_master SET type = 'table' WHERE name = 'messages'")
+    database.close()
+    with pytest.raises(BagError, match="cannot be read"):
+        BagReader(file)
 
 
 @pytest.mark.parametrize("compression", ["zstd", "lz4"])

@@ -599,6 +599,24 @@ def _bag_metadata() -> Target:
     return Target([sample], parse, (BagError,), _YAML_WORDS)
 
 
+@target("sqlite-bag", 60)
+def _sqlite_bag() -> Target:
+    from rosbags.rosbag2 import StoragePlugin, Writer
+
+    from instant_ic.bag import BagError
+    from instant_ic.bag.metadata import ros_qos
+    from instant_ic.bus.qos import SENSOR
+    from instant_ic.msg import typestore
+
+    folder = _folder() / "bag"
+    with Writer(folder, version=9, storage_plugin=StoragePlugin.SQLITE3) as writer:
+        connection = writer.add_connection(
+            "/text", "std_msgs/msg/String", typestore=typestore(), offered_qos_profiles=[ros_qos(SENSOR)]
+        )
+        writer.write(connection, 1, b"\0\1\0\0\6\0\0\0hello\0")
+    return Target([next(folder.glob("*.db3")).read_bytes()], _by_file("bag.db3", _read_bag), (BagError,))
+
+
 # -- files -------------------------------------------------------------------------------------------------------------
 
 

@@ -51,7 +51,7 @@ def _add_play(verbs: Any) -> None:
     text, example = "play a bag with /clock", "ic bag play drive --rate 2"
     playing = verb(verbs, "play", text, "bag_run.play", f"{example} --start 10")
     add = playing.add_argument
-    add("bag", metavar="BAG", help="folder or .mcap file")
+    add("bag", metavar="BAG", help="folder, .mcap or .db3 file")
     _topics(playing)
     add("-r", "--rate", type=float, default=1.0, help="speed factor (default: %(default)s)")
     add("--start", **_SPAN, default=0.0, help="start at this offset")
