@@ -91,14 +91,6 @@ def open_page(browser, request):
     assert not faults
 
 
-@pytest.fixture
-def pad_page(open_page):
-    page = open_page()
-    page.evaluate(f"() => {{ {PAD} }}")
-    page.bring_to_front()
-    return page
-
-
 @pytest.fixture(scope="module")
 def shared_demo():
     demo = make_demo()

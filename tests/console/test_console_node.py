@@ -390,19 +390,6 @@ def test_layers_that_no_page_could_render_are_a_fault_of_the_console(setup):
     assert "layers[0].image is empty" in node.diagnoses()["layers"][1]
 
 
-@pytest.mark.parametrize(("vspace", "counts"), [(VspaceStatus.TRAINING, (3, 4)), (VspaceStatus.EMPTY, (0,))])
-def test_real_mode_keeps_the_renderer_warm_once_a_second(setup, vspace, counts):
-    bus, _, _ = setup
-    publish_tree(bus)
-    for _ in range(60):
-        bus.publish("/vspace/status", vspace_status(vspace), latched=True)
-        bus.publish("/ic/state", control(bus, ControlState.REAL), latched=True)
-        bus.advance(0.05)
-        if bus.messages("/view/request"):
-            bus.publish("/vspace/view", view_message(bus, bus.last("/view/request").id))
-    assert len(bus.messages("/view/request")) in counts
-
-
 def test_map_is_sent_when_changed_and_at_most_twice_a_second(setup):
     bus, _, server = setup
     grid = np.zeros((10, 10), np.int8)

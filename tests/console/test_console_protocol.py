@@ -36,31 +36,6 @@ def test_layout_of_a_frame_by_hand():
     assert encode_frame(PageFrame(FrameKind.VIEW, 5, {"a": 1}, b"JPEG")) == expected
 
 
-@given(st.binary(max_size=80))
-def test_any_bytes_are_a_frame_or_a_protocol_error(data):
-    try:
-        frame = decode_frame(data)
-    except PageProtocolError:
-        return
-    assert isinstance(frame.header, dict)
-
-
-@pytest.mark.parametrize(
-    ("data", "words"),
-    [
-        (b"\x01\x01", "prefix"),
-        (bytes([9, 1, 0, 0, 0, 0, 0, 0, 2, 0, 0, 0]) + b"{}", "version 9"),
-        (bytes([1, 77, 0, 0, 0, 0, 0, 0, 2, 0, 0, 0]) + b"{}", "77"),
-        (bytes([1, 1, 0, 0, 0, 0, 0, 0, 3, 0, 0, 0]) + b"{}", "should end"),
-        (bytes([1, 1, 0, 0, 0, 0, 0, 0, 2, 0, 0, 0]) + b"[]", "list"),
-        (bytes([1, 1, 0, 0, 0, 0, 0, 0, 2, 0, 0, 0]) + b"\xff\xff", "frame"),
-    ],
-)
-def test_what_is_wrong_with_a_frame_is_told(data, words):
-    with pytest.raises(PageProtocolError, match=words):
-        decode_frame(data)
-
-
 def test_pieces_make_the_frame_they_are_of_and_a_missing_one_is_told():
     whole = encode_frame(PageFrame(FrameKind.LAYERS, 7, {"a": 1}, b"layers"))
 

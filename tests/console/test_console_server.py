@@ -31,25 +31,6 @@ def in_thread(function, *args):
     return asyncio.get_running_loop().run_in_executor(None, function, *args)
 
 
-def test_page_and_modules_are_served_with_a_content_policy(serve):
-    server = serve()
-
-    async def scenario():
-        async with aiohttp.ClientSession() as http:
-            async with http.get(server.url) as response:
-                page = await response.text()
-                assert response.status == 200
-                assert "default-src 'self'" in response.headers["Content-Security-Policy"]
-            assert "http://" not in page and "https://" not in page  # nothing from elsewhere
-            async with http.get(server.url + "static/app.js") as response:
-                assert response.status == 200
-                assert "javascript" in response.headers["Content-Type"]
-            async with http.get(server.url + "static/../server.py") as response:
-                assert response.status == 404
-
-    asyncio.run(scenario())
-
-
 def test_the_first_page_and_the_end_of_the_last_are_reported(serve):
     server = serve()
     watched = []

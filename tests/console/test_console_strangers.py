@@ -555,31 +555,6 @@ def test_log_lines_of_one_place_come_once_a_second_with_a_count():
 
 
 @pytest.mark.parametrize(
-    "text",
-    [
-        "[" * 4000,
-        '{"type":"drive","seq":9,"time_ms":TIME,"linear":NaN,"angular":0}',
-        '{"type":"drive","seq":9,"time_ms":NaN,"linear":0.1,"angular":0}',
-        '{"type":"drive","seq":9,"time_ms":TIME,"linear":' + "9" * 3900 + ',"angular":0}',
-        '{"type":"\\ud800"}',
-    ],
-)
-def test_fault_hostile_json_drives_or_ends_the_server(serve, text):
-    server = serve()
-
-    async def scenario():
-        async with ConsoleClient(server.url) as client:
-            await client.acquire()
-            await client.socket.send_str(text.replace("TIME", str(server.now_ms())))
-            await client.wait_for(lambda c: len(c.errors) == 1)
-            await client.send_drive(0.1, 0.0)  # the connection is well
-            await until(lambda: (0.1, 0.0) in server.backend.commands)
-
-    run(scenario)
-    assert set(server.backend.commands) == {(0.0, 0.0), (0.1, 0.0)}
-
-
-@pytest.mark.parametrize(
     ("kind", "payload", "code"),
     [(WSMsgType.BINARY, b"x", 1003), (WSMsgType.TEXT, b"x" * 5000, 1009), (WSMsgType.TEXT, b"\xff", 1007)],
     ids=["binary", "too long", "no UTF-8"],
