@@ -84,7 +84,8 @@ def save_grid(stem: Path, grid: OccupancyGrid) -> list[Path]:
 def load_grid(path: Path) -> OccupancyGrid:
     """Read a ROS map from its YAML file, given with or without extension.
 
-    Modes ``trinary``, ``scale`` and ``raw`` follow map_server; the image may be PGM or any format that OpenCV reads.
+    Cells are free, occupied or unknown, as in map_server's mode ``trinary``; the image may be PGM or any format that
+    OpenCV reads.
 
     Raises:
         MapError: a file is missing or invalid.
@@ -113,8 +114,8 @@ def load_grid(path: Path) -> OccupancyGrid:
     if len(origin) > 2 and abs(origin[2]) > 1e-6:
         raise MapError(f"{path}: a rotated map (origin yaw {origin[2]}) is not supported: rotate the image instead")
     mode = str(content.get("mode", "trinary"))
-    if mode not in ("trinary", "scale", "raw"):
-        raise MapError(f"{path}: mode must be trinary, scale or raw (got {mode!r})")
+    if mode != "trinary":
+        raise MapError(f"{path}: mode must be trinary (got {mode!r}); save the map again with mode trinary")
     image = path.parent / str(content.get("image", ""))
     try:
         found = image.is_file()
@@ -127,19 +128,12 @@ def load_grid(path: Path) -> OccupancyGrid:
         raise MapError(f"{image} cannot be decoded as an image")
     grey = picture[::-1].astype(np.float64)
     values = np.full(grey.shape, -1, dtype=np.int8)
-    if mode == "raw":
-        known = grey <= 100
-        values[known] = grey[known].astype(np.int8)
-        return OccupancyGrid(values, resolution, np.array(origin[:2], dtype=np.float64))
     negate = resolved(content.get("negate"))
     share = grey / 255 if negate else (255 - grey) / 255
     # Grey 205 is unknown, whatever the threshold: nav2 writes 0.25, which would make it free.
     unknown = (grey == 205) & (not negate)
     values[(share < free) & ~unknown] = 0
     values[share > occupied] = 100
-    if mode == "scale":
-        between = (share >= free) & (share <= occupied) & ~unknown
-        values[between] = np.rint(99 * (share[between] - free) / (occupied - free)).astype(np.int8)
     return OccupancyGrid(values, resolution, np.array(origin[:2], dtype=np.float64))
 
 

@@ -84,12 +84,9 @@ def write_map(folder: Path, pixels: bytes, text: str) -> Path:
         # Shares occupied of 0, 50, 100, 205, 254: 1.0, 0.80, 0.61, 0.196, 0.004.
         ("mode: trinary\nnegate: 0\noccupied_thresh: 0.65\nfree_thresh: 0.25\n", [100, 100, -1, -1, 0]),
         ("negate: 1\noccupied_thresh: 0.65\nfree_thresh: 0.25\n", [0, 0, -1, 100, 100]),
-        # Between the thresholds 0.3 and 0.9: 99 · (share − 0.3) / 0.6.
-        ("mode: scale\noccupied_thresh: 0.9\nfree_thresh: 0.3\n", [100, 83, 51, -1, 0]),
-        ("mode: raw\n", [0, 50, 100, -1, -1]),
     ],
 )
-def test_modes_of_map_server(tmp_path: Path, text: str, expected: list[int]) -> None:
+def test_thresholds_of_map_server(tmp_path: Path, text: str, expected: list[int]) -> None:
     grid = load_grid(write_map(tmp_path, bytes([0, 50, 100, 205, 254]), text))
     assert grid.values.tolist() == [expected]
 
@@ -101,6 +98,7 @@ def test_modes_of_map_server(tmp_path: Path, text: str, expected: list[int]) -> 
         ("image: p.pgm\nresolution: 0\norigin: [0, 0, 0]\n", "resolution must be > 0"),
         ("image: p.pgm\nresolution: x\norigin: [0, 0, 0]\n", "resolution must be a number"),
         ("image: p.pgm\nresolution: .1\norigin: [0, 0, 0.5]\n", "rotated map"),
+        ("image: p.pgm\nresolution: .1\norigin: [0, 0, 0]\nmode: raw\n", "mode must be trinary"),
         ("image: p.pgm\nresolution: .1\norigin: [0, 0, 0]\nfree_thresh: 0.9\n", "free_thresh < occupied_thresh"),
         ("image: none.pgm\nresolution: .1\norigin: [0, 0, 0]\n", "does not exist"),
         ("image: bad.pgm\nresolution: .1\norigin: [0, 0, 0]\n", "cannot be decoded"),
