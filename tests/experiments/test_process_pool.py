@@ -1,6 +1,7 @@
 """Calls in processes: one that hangs or dies is lost, the others are done, and no process is left."""
 
 import os
+import signal
 import threading
 import time
 from pathlib import Path
@@ -63,9 +64,13 @@ def test_an_interrupt_leaves_no_process(tmp_path: Path) -> None:
     def interrupt() -> None:
         while len(list(tmp_path.iterdir())) < 2:
             time.sleep(0.05)
-        os.kill(os.getpid(), 2)
+        signal.pthread_kill(threading.main_thread().ident, signal.SIGINT)
 
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
     threading.Thread(target=interrupt, daemon=True).start()
-    with pytest.raises(KeyboardInterrupt):
-        run_all(behave, [("hang", tmp_path)] * 2, 2, nothing)
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            run_all(behave, [("hang", tmp_path)] * 2, 2, nothing)
+    finally:
+        signal.signal(signal.SIGINT, before)
     assert not left(tmp_path)
