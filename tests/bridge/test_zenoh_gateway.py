@@ -146,6 +146,38 @@ def test_each_node_that_publishes_stands_in_the_ros_graph_until_it_ends(world):
     wait_for(lambda: not any(tokens.values()), "the end of all tokens")
 
 
+def test_independent_client_sees_our_topics_types_and_messages(world, sdk):
+    from zenoh_ros2_sdk import ROS2Subscriber
+    from zenoh_ros2_sdk.discovery import get_topic_info, get_topic_names_and_types
+
+    world.gateway("robot", namespace="robot1", publish=("/chatter", "/scan"))
+    talker = world.neighbour("robot")
+    out = talker.publisher("/chatter", String)
+    talker.node.publisher_raw("/scan", "sensor_msgs/msg/LaserScan", SENSOR)
+    wanted = {("/robot1/chatter", STRING), ("/robot1/scan", "sensor_msgs/msg/LaserScan")}
+
+    def seen():
+        listed = get_topic_names_and_types(0, timeout=5.0, **sdk)
+        topics = {(topic, name) for topic, names in listed for name in names}
+        return wanted <= topics
+
+    wait_for(seen, "our topics in the client's list")
+    info = wait_for(lambda: get_topic_info("/robot1/chatter", 0, timeout=5.0, verbose=True, **sdk), "the topic's info")
+    (publisher,) = info.publishers
+    assert (publisher.node_name, publisher.node_namespace.strip("/")) == ("talker", "robot1")
+    assert publisher.type_hash == type_hash(STRING)
+    texts = []
+    subscriber = ROS2Subscriber(
+        "/robot1/chatter", STRING, lambda m: texts.append(m.data), msg_definition="string data\n", domain_id=0, **sdk
+    )
+    try:
+        assert subscriber.type_hash == type_hash(STRING)  # computed by the client from the definition
+        publish_until(out, String("hello"), lambda: texts, "message at the client")
+    finally:
+        subscriber.close()
+    assert set(texts) == {"hello"}
+
+
 def static(child):
     import numpy as np
 
@@ -429,6 +461,33 @@ def test_commands_do_not_come_in_where_they_are_not_configured(world):
 
 
 # -- a fleet, links, configuration ---------------------------------------------------------------------
+
+
+def test_two_robots_and_a_station_do_not_mix(world):
+    out = {}
+    for name in ("robot1", "robot2"):
+        world.gateway(name, namespace=name, publish=("/chatter",))
+        out[name] = world.neighbour(name).publisher("/chatter", String)
+    world.gateway("station", namespace="robot2", subscribe=("/chatter",))
+    world.keep(
+        LiveNode(
+            world.run_dir("station"),
+            ZenohGatewayNode,
+            ZenohGatewayConfig(connect=(world.endpoint,), subscribe=("/robot*/chatter",)),
+            "fleet_gateway",
+        )
+    )
+    listener = world.neighbour("station", "listener")
+    chosen, first, second = (listener.listen(t) for t in ("/chatter", "/robot1/chatter", "/robot2/chatter"))
+
+    def all_heard():
+        for name, publisher in out.items():
+            publisher.publish(String(name))
+        return chosen and first and second
+
+    listener.wait(all_heard, "messages of both robots")
+    said = [{deserialize(m.payload, STRING).data for m in messages} for messages in (chosen, first, second)]
+    assert said == [{"robot2"}, {"robot1"}, {"robot2"}]
 
 
 def test_a_client_waits_for_its_router_and_finds_it(tmp_path_factory, monkeypatch):
