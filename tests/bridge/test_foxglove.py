@@ -329,13 +329,15 @@ def test_a_frame_that_is_too_long_ends_the_connection(shared_world):
 # -- start and end -------------------------------------------------------------------------------------
 
 
-def test_a_port_in_use_is_reported(tmp_path):
+def test_a_port_in_use_is_reported(tmp_path_factory):
     port = free_port()
     with socket.socket() as other:
         other.bind(("127.0.0.1", port))
         other.listen()
         with pytest.raises(NodeError, match=rf"no server on 127\.0\.0\.1:{port}: .*in use.*set host or port"):
-            LiveNode(tmp_path, FoxgloveBridgeNode, FoxgloveBridgeConfig(port=port), "foxglove_bridge")
+            LiveNode(
+                tmp_path_factory.mktemp("r"), FoxgloveBridgeNode, FoxgloveBridgeConfig(port=port), "foxglove_bridge"
+            )
 
 
 # -- against foxglove-sdk's own server -----------------------------------------------------------------
