@@ -40,8 +40,10 @@ class ClockFilter:
         """Add one exchange; return None if its stamps are inconsistent.
 
         Args:
-            sent_ns, returned_ns: our clock at the start and end.
-            arrived_ns, answered_ns: the other clock when the request arrived and the answer left.
+            sent_ns: our clock when the request left.
+            arrived_ns: the other clock when the request arrived.
+            answered_ns: the other clock when the answer left.
+            returned_ns: our clock when the answer arrived.
         """
         rtt = (returned_ns - sent_ns) - (answered_ns - arrived_ns)
         if rtt < 0 or answered_ns < arrived_ns or returned_ns < sent_ns:

@@ -142,7 +142,7 @@ class _Outgoing:
 
     @property
     def queued(self) -> bool:
-        """Whether every message is sent; not where the other side requested a lower rate."""
+        """True if every message is sent, unless the other side requested a lower rate."""
         return self.channel.queued and not self.period_ns
 
 

@@ -168,6 +168,7 @@ class HostLink(ABC):
         Args:
             topic: one of ``exports``.
             origin: node that published it.
+            type_name: type of the message.
             qos: name of the preset, whether latched, whether reliable.
             payload: CDR bytes; copied if a host takes them.
             publish_ns: time of publication.

@@ -541,14 +541,14 @@ class Session:
         return self._deliver(incoming, arrived, data.born_ns)
 
     def _shares(self, arrived: Arrived, rule: TopicRule, now: int) -> bool:
-        """Whether a message is taken from a host that does not drive: a shared topic, no release, and no flood."""
+        """Return whether a host that does not drive may send this message: a shared topic, no release, no flood."""
         announce, payload = arrived.announce, arrived.payload
         if not rule.shared or releases(announce.type_name, payload):
             return False
         return announce.topic in COMMANDS or self._shared.take(now / 1e9, len(payload) + DATA_OVERHEAD)
 
     def _is_held(self, key: tuple[str, str, str], announce: Announce, payload: bytes | bytearray, now: int) -> bool:
-        """Whether a command comes from controls held since before this host drove: no robot starts under a held key.
+        """Return whether the controls were held since before this host drove: no robot starts under a held key.
 
         Letting go is a zero, or a silence that no link outlives: a shorter one may be a stall of the network.
         """

@@ -15,7 +15,7 @@ _TOPIC = re.compile(r"(/[A-Za-z_][A-Za-z0-9_]*)+\Z")
 
 
 def releases(type_name: str, payload: bytes | bytearray) -> bool:
-    """Whether a message on a shared state releases the emergency stop."""
+    """Return whether a message on a shared state releases the emergency stop."""
     try:
         return type_name == "std_msgs/msg/Bool" and not deserialize(payload, type_name).data
     except MessageError:  # not a readable message; the subscriber refuses and reports it
@@ -23,7 +23,7 @@ def releases(type_name: str, payload: bytes | bytearray) -> bool:
 
 
 def moves(type_name: str, payload: bytes | bytearray) -> bool:
-    """Whether a message is a command to move."""
+    """Return whether a message is a command to move."""
     try:
         return type_name in _COMMANDS and any(twist_values(deserialize(payload, type_name)))
     except MessageError:

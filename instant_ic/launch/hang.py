@@ -33,7 +33,7 @@ class HeartbeatSilence:
         """Time of the newest heartbeat; None before the first."""
         self.lasts_s = 0.0
         self.reported = False
-        """Whether the operator knows of this silence."""
+        """True once the operator knows of this silence."""
         self._active_s = active_s
         self._active_before_s = 0.0
 

@@ -82,7 +82,7 @@ class StackScreen:
         self._reported_faults: tuple[str, ...] = ()
         self._verbose = verbose
         self._shows = dict.fromkeys(nodes, True)
-        """Whether a node's last log line was shown; the lines of a traceback follow it."""
+        """True if a node's last log line was shown; the lines of a traceback follow it."""
         self._shown: set[tuple[str, str]] = set()
         self._held_back: list[tuple[str, str]] = []
 

@@ -18,7 +18,8 @@ from instant_ic.vspace.view import perspective_rays
 TRIALS = 2
 """Older keyframes that are rendered, at most."""
 _SIZE, _FOV = (256, 144), math.pi / 2
-"""Of a trial's view in pixels: as fine as a panorama of 1024 columns, so that neither side is blurred."""
+"""Size of a trial's view in pixels, and its field of view: as fine as a panorama of 1024 columns, so that neither side
+is blurred."""
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ from instant_ic.vspace.nerf.march import along
 NEAR_M = 0.02
 """Surfaces nearer to the view's plane are cut away."""
 EMPTY, FILLED, KNOWN, BEHIND = 0, 1, 2, 3
-"""What a pixel shows: nothing, a surface of filled depth, one of known depth, one from its back."""
+"""Content of a pixel: nothing, a surface of filled depth, one of known depth, one from its back."""
 MAX_TAPS = 8
 """Samples along a stretched footprint, at most."""
 

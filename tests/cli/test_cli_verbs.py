@@ -1,4 +1,4 @@
-"""What all commands of ``ic`` have in common; ``ic launch``, ``ic run`` and ``ic replay`` on the command line."""
+"""Behaviour that all commands of ``ic`` share; ``ic launch``, ``ic run`` and ``ic replay`` on the command line."""
 
 import os
 import shutil

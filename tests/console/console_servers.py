@@ -1,4 +1,4 @@
-"""What the tests of the server by real sockets share: its backend, its time-outs and its tokens."""
+"""Backend, time-outs and tokens that the tests of the server over real sockets share."""
 
 import asyncio
 import threading

@@ -1,4 +1,4 @@
-"""What the operator has besides driving, in Chromium: recording, overlay, a phone, no mouse, no colours."""
+"""The page besides driving, in Chromium: recording, overlay, a phone, no mouse, no colours."""
 
 import io
 import itertools
