@@ -205,8 +205,7 @@ def field_or_warp(run: GpuRun) -> dict[str, Any]:
     sources = {
         "warp": dataclasses.replace(alone, source="warp"),
         "field": alone,
-        # Only plain torch has its kernels on a GPU.
-        "density": dataclasses.replace(alone, field=density, device=alone.device.replace("triton", "torch-cuda")),
+        "density": dataclasses.replace(alone, field=density, device="cpu"),  # the GPU has no kernels for it
     }
     for world in run.worlds:
         place = SimulatedPlace(world, run.view)
@@ -258,7 +257,7 @@ def main() -> int:
         parser.error(f"--step: no such step: {', '.join(unknown)}; there are {', '.join(STEPS)}")
     if not (args.cpu or torch.cuda.is_available()):
         parser.error("torch finds no CUDA device; --cpu measures the CPU's kernels")
-    run = GpuRun(("triton", "torch-cuda"), args.seconds, args.worlds.split(","))
+    run = GpuRun(("cuda",), args.seconds, args.worlds.split(","))
     if args.cpu:
         torch.set_num_threads(1)
         small = {"view": (320, 180), "clock": time.process_time, "train": TrainConfig(iterations=1000)}

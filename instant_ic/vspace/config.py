@@ -120,8 +120,7 @@ class VirtualSpaceConfig:
         mesh_pose: pose of the mesh in the map: x, y, z (m), yaw (degrees, counter-clockwise).
         mesh_max_triangles: larger meshes are refused.
         mesh_fit_colours: a factor a colour, so that the mesh looks like the newest keyframe.
-        device: auto: triton where it works, else cpu (numba); cuda: triton where it works, else torch-cuda;
-            torch-cpu (slow).
+        device: cpu: numba; cuda: Triton on an NVIDIA GPU, geometry distance only; auto: cuda where it works, else cpu.
         panorama_width: px; wider panoramas are area-averaged to this.
         keyframes: newest keyframes that the field is trained on together, 1..8.
         older: older keyframes, from up to 3 m away, whose pixels show what is hidden from the newest; costs nothing per
@@ -146,8 +145,9 @@ class VirtualSpaceConfig:
 
     def __post_init__(self) -> None:
         check_ranges(self)
-        devices = ("auto", "cpu", "cuda", "triton", "torch-cuda", "torch-cpu")
-        require(self, "device", self.device in devices, "one of " + ", ".join(devices))
+        require(self, "device", self.device in ("auto", "cpu", "cuda"), "auto, cpu or cuda")
+        cuda_density = self.device == "cuda" and self.field.geometry == "density"
+        require(self, "device", not cuda_density, "auto or cpu with geometry density")
         require(self, "source", self.source in ("auto", "field", "warp", "mesh"), "auto, field, warp or mesh")
         require(self, "mesh", self.source != "mesh" or bool(self.mesh), "a file with source: mesh")
         require(self, "mesh_pose", len(self.mesh_pose) == 4, "x, y, z in metres and yaw in degrees")

@@ -1,4 +1,4 @@
-"""Choice of the backend: numba on the CPU, the Triton kernels on an NVIDIA GPU, or plain torch on either."""
+"""Choice of the backend: the Triton kernels on an NVIDIA GPU, else numba on the CPU."""
 
 from __future__ import annotations
 
@@ -17,17 +17,12 @@ from instant_ic.vspace.prior import prepare
 from instant_ic.vspace.view import perspective_rays
 
 T = TypeVar("T")
-MakeDevice = Callable[[FieldConfig, TrainConfig], Device]
 AGREEMENT = 0.1
-"""Allowed difference between Triton's and plain torch's training errors, as a share: half tables, other rounding."""
+"""Allowed relative difference between Triton's and numba's training errors: Triton's tables are float16."""
 
 
 class DeviceError(RuntimeError):
     """The requested device is absent or does not work."""
-
-
-class KernelError(DeviceError):
-    """The Triton kernels are absent, or do not work on this GPU."""
 
 
 def is_out_of_memory(error: Exception) -> bool:
@@ -44,37 +39,27 @@ def is_device_fault(error: Exception) -> bool:
 def make_device(config: VirtualSpaceConfig) -> tuple[Device, str]:
     """Return the backend for ``config.device``, and a warning (empty when there is none).
 
+    The Triton kernels are compiled here (seconds at the first start of an installation, then kept on disk), and their
+    results compared with numba's.
+
     Raises:
-        DeviceError: a device was asked for that is not there, or does not work.
+        DeviceError: the GPU was asked for, and it is not there or does not work.
     """
-    warning = ""
-    wants_gpu = config.device in ("cuda", "triton", "torch-cuda")
-    if wants_gpu or (config.device == "auto" and _may_have_cuda()):
+    warning, wants_gpu = "", config.device == "cuda"
+    if wants_gpu or (config.device == "auto" and config.field.geometry == "distance" and _may_have_cuda()):
         import torch
 
         if torch.cuda.is_available():
             try:
-                return _make_gpu_device(config), ""
-            except torch.OutOfMemoryError as error:
+                return _gpu_device(config), ""
+            except (DeviceError, torch.OutOfMemoryError) as error:
                 if wants_gpu:
                     raise
-                warning = f"the GPU is out of memory; on the CPU ({error})"
-            except KernelError as error:
-                if config.device == "triton":
-                    raise DeviceError(f"device is triton, but {error}") from error
-                if config.device == "cuda":
-                    slow = f"{error}: on the GPU by plain torch, which takes a second and more for a view"
-                    return _plain_torch(config.field, config.train), slow
-                warning = f"{error}: on the CPU"
+                reason = f"the GPU is out of memory ({error})" if is_out_of_memory(error) else str(error)
+                warning = f"{reason}: on the CPU"
         elif wants_gpu:
-            raise DeviceError(f"device is {config.device}, but torch finds no CUDA device; use auto or cpu")
-    if config.device != "torch-cpu":
-        from instant_ic.vspace.nerf.numba_device import NumbaDevice
-
-        return NumbaDevice(config.field, config.train), warning
-    from instant_ic.vspace.nerf.torch_device import TorchDevice
-
-    return TorchDevice(config.field, config.train, "cpu"), warning
+            raise DeviceError("device is cuda, but torch finds no CUDA device; use auto or cpu")
+    return _cpu_device(config.field, config.train), warning
 
 
 class FallbackDevice:
@@ -164,45 +149,40 @@ def _may_have_cuda() -> bool:
     return any(Path(place).exists() for place in ("/dev/nvidiactl", "/dev/nvmap", "/dev/dxg"))
 
 
-def _plain_torch(field: FieldConfig, train: TrainConfig) -> Device:
-    from instant_ic.vspace.nerf.torch_device import TorchDevice
+def _cpu_device(field: FieldConfig, train: TrainConfig) -> Device:
+    from instant_ic.vspace.nerf.numba_device import NumbaDevice  # compiled code: half a second
 
-    return TorchDevice(field, train, "cuda")
+    return NumbaDevice(field, train)
 
 
-def _make_gpu_device(config: VirtualSpaceConfig) -> Device:
-    """``make_device`` on a machine with CUDA.
-
-    The Triton kernels are compiled here (seconds at the first start of an installation, then kept on disk), and their
-    results compared with plain torch's.
+def _gpu_device(config: VirtualSpaceConfig) -> Device:
+    """Return the Triton backend after a check of its results.
 
     Raises:
-        KernelError: they fail.
+        DeviceError: Triton is absent, or its kernels do not work on this GPU.
     """
-    if config.device == "torch-cuda" or (config.device != "triton" and config.field.geometry != "distance"):
-        return _plain_torch(config.field, config.train)
     try:
         from instant_ic.vspace.nerf.triton_device import TritonDevice
 
-        check_device(TritonDevice, _plain_torch, config.field)
+        check_device(TritonDevice, config.field)
         return TritonDevice(config.field, config.train)
     except ImportError as error:
-        raise KernelError(f"Triton is not installed ({error}); pip install 'instant-ic[triton]'") from error
-    except Exception as error:  # a compiler, a driver: whatever they raise, other devices still work
+        raise DeviceError(f"Triton is not installed ({error}); pip install 'instant-ic[triton]'") from error
+    except Exception as error:  # a compiler, a driver: whatever they raise, the CPU still works
         if is_out_of_memory(error):
             raise
-        raise KernelError(f"the Triton kernels do not work here ({type(error).__name__}: {error})") from error
+        raise DeviceError(f"the Triton kernels do not work here ({type(error).__name__}: {error})") from error
 
 
-def check_device(make: MakeDevice, make_reference: MakeDevice, field: FieldConfig) -> None:
-    """Compare two training steps and a view of a scratch scene with another backend's, so that all kernels are run.
+def check_device(make: Callable[[FieldConfig, TrainConfig], Device], field: FieldConfig) -> None:
+    """Compare two training steps and a view of a scratch scene with numba's, so that all kernels are run.
 
     Raises:
-        DeviceError: the results are not alike.
+        DeviceError: the results differ.
     """
     small = dataclasses.replace(field, log2_table=10)
     train = TrainConfig(ray_columns=16, ray_rows=8)
-    ours, theirs = make(small, train), make_reference(small, train)
+    ours, theirs = make(small, train), _cpu_device(small, train)
     scene, rays = _scratch(small)
     uniform = np.random.default_rng(0).random((2, train.ray_columns * train.ray_rows, 3), np.float32)
     for device in (ours, theirs):
@@ -210,11 +190,11 @@ def check_device(make: MakeDevice, make_reference: MakeDevice, field: FieldConfi
     for number in range(2):  # the second is the graph's
         found, expected = (device.step(uniform[number], 0.01, 0.01) for device in (ours, theirs))
         if not np.allclose(found, expected, rtol=AGREEMENT, atol=1e-4):
-            raise DeviceError(f"step {number + 1} has the errors {found}, plain torch {expected}")
+            raise DeviceError(f"step {number + 1} has the errors {found}, numba {expected}")
     colours, depths, _ = zip(*(device.draw(rays, 0.5, 0.9) for device in (ours, theirs)), strict=True)
     alike = np.isclose(depths[0], depths[1], rtol=0.02) & np.all(np.abs(colours[0] - colours[1]) < 0.05, axis=1)
     if alike.mean() < 0.9:
-        raise DeviceError(f"only {alike.mean():.0%} of an image's pixels are as plain torch renders them")
+        raise DeviceError(f"only {alike.mean():.0%} of an image's pixels are as numba renders them")
 
 
 def _scratch(field: FieldConfig) -> tuple[TrainingScene, Rays]:

@@ -1,26 +1,20 @@
-"""Which device is taken, and what happens where a GPU's kernels fail; the GPU is played by torch on the CPU."""
+"""Choice of the backend, and failures of a GPU's kernels; the GPU is simulated by torch on the CPU."""
 
 import dataclasses
 import sys
 import types
 
-import numpy as np
 import pytest
 import torch
 
-from instant_ic.vspace import FieldConfig, SpaceState, TrainConfig, VirtualSpace, VirtualSpaceConfig, devices
+from instant_ic.vspace import FieldConfig, TrainConfig, VirtualSpace, VirtualSpaceConfig, devices
 from instant_ic.vspace.devices import DeviceError, check_device, make_device
 from instant_ic.vspace.nerf.numba_device import NumbaDevice
-from instant_ic.vspace.nerf.torch_device import TorchDevice
-from tests import box_room
+from tests.vspace.torch_device import TorchDevice
 
 CONFIG = VirtualSpaceConfig(
     field=FieldConfig(levels=2, log2_table=10, hidden=8), train=TrainConfig(ray_columns=16, ray_rows=16)
 )
-
-
-def plain(field, train, device="cpu"):
-    return TorchDevice(field, train, "cpu")
 
 
 class Broken(TorchDevice):
@@ -46,7 +40,6 @@ def gpu(monkeypatch):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr(devices, "_may_have_cuda", lambda: True)
     monkeypatch.setitem(sys.modules, "instant_ic.vspace.nerf.triton_device", types.SimpleNamespace(TritonDevice=kind))
-    monkeypatch.setattr("instant_ic.vspace.nerf.torch_device.TorchDevice", plain)
     return kind
 
 
@@ -61,14 +54,13 @@ def test_without_a_gpu_numba_is_taken(monkeypatch):
     assert not warning
 
 
-@pytest.mark.parametrize("name", ["cuda", "triton", "torch-cuda"])
-def test_a_gpu_asked_for_that_is_not_there_is_told(monkeypatch, name):
+def test_a_gpu_asked_for_that_is_not_there_is_told(monkeypatch):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
-    with pytest.raises(DeviceError, match=f"device is {name}, but torch finds no CUDA device; use auto or cpu"):
-        make_device(with_device(name))
+    with pytest.raises(DeviceError, match="device is cuda, but torch finds no CUDA device; use auto or cpu"):
+        make_device(with_device("cuda"))
 
 
-@pytest.mark.parametrize("name", ["auto", "cuda", "triton"])
+@pytest.mark.parametrize("name", ["auto", "cuda"])
 def test_kernels_that_are_right_are_taken(gpu, name):
     device, warning = make_device(with_device(name))
     assert isinstance(device, gpu)
@@ -83,30 +75,28 @@ def test_kernels_that_are_right_are_taken(gpu, name):
         ({"factor": float("nan")}, "step 1 has the errors"),
     ],
 )
-def test_kernels_that_fail_are_left_for_plain_torch_with_a_warning(gpu, fault, words):
+def test_kernels_that_fail_are_left_for_the_cpu_with_a_warning(gpu, fault, words):
     for key, value in fault.items():
         setattr(gpu, key, value)
-    space = VirtualSpace(with_device("cuda"))
-    assert words in space.status.warning
-    assert "by plain torch" in space.status.warning
-    picture = box_room.panorama(np.eye(4), 32)
-    space.set_keyframe(picture.rgb, picture.depth_m, np.eye(4), 0.05)
-    space.train(iterations=2)
-    assert space.status.iterations == 2  # and it works
-    assert space.status.state != SpaceState.FAILED
-    with pytest.raises(DeviceError, match="device is triton, but the Triton kernels do not work"):
-        make_device(with_device("triton"))
-    device, warning = make_device(with_device("auto"))
-    assert isinstance(device, NumbaDevice)  # plain torch renders a view in 1.8 s on an H100
-    assert words in warning and "on the CPU" in warning
+    with pytest.raises(DeviceError, match="the Triton kernels do not work here"):
+        make_device(with_device("cuda"))
+    space = VirtualSpace(with_device("auto"))
+    assert isinstance(space.device.backend, NumbaDevice)
+    assert words in space.status.warning and "on the CPU" in space.status.warning
 
 
 def test_a_missing_triton_is_told(gpu, monkeypatch):
     monkeypatch.setitem(sys.modules, "instant_ic.vspace.nerf.triton_device", None)  # importing it is an ImportError
-    for name, kind in (("auto", NumbaDevice), ("cuda", TorchDevice)):
-        device, warning = make_device(with_device(name))
-        assert isinstance(device, kind)
-        assert "pip install 'instant-ic[triton]'" in warning
+    device, warning = make_device(with_device("auto"))
+    assert isinstance(device, NumbaDevice)
+    assert "pip install 'instant-ic[triton]'" in warning
+
+
+def test_a_density_field_runs_on_the_cpu(gpu):
+    density = dataclasses.replace(CONFIG, field=dataclasses.replace(CONFIG.field, geometry="density"))
+    assert isinstance(make_device(density)[0], NumbaDevice)
+    with pytest.raises(ValueError, match="with geometry density"):
+        dataclasses.replace(density, device="cuda")
 
 
 def test_a_gpu_without_memory_is_no_fault_of_the_kernels(gpu):
@@ -119,12 +109,12 @@ def test_a_gpu_without_memory_is_no_fault_of_the_kernels(gpu):
     assert "2 GiB wanted" in warning
 
 
-def test_the_check_compares_pictures_too():
+def test_the_check_compares_views_too():
     class WrongColours(Broken):
         def draw(self, *arguments):
             colour, depth, confidence = super().draw(*arguments)
             return 1 - colour, depth, confidence
 
-    check_device(Broken, plain, CONFIG.field)
+    check_device(Broken, CONFIG.field)
     with pytest.raises(DeviceError, match="of an image's pixels"):
-        check_device(WrongColours, plain, CONFIG.field)
+        check_device(WrongColours, CONFIG.field)

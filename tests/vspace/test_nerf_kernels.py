@@ -15,10 +15,10 @@ from instant_ic.vspace.nerf.field import FieldParameters, Lattice, StackedPriors
 from instant_ic.vspace.nerf.numba_device import NumbaDevice
 from instant_ic.vspace.nerf.occupancy import build_occupancy
 from instant_ic.vspace.nerf.reference import TorchField
-from instant_ic.vspace.nerf.torch_device import TorchDevice, torch_priors
 from instant_ic.vspace.prior import MOVED, prepare
 from instant_ic.vspace.view import perspective_rays
 from tests import box_room
+from tests.vspace.torch_device import TorchDevice, torch_priors
 
 F = np.float32
 FOCUS = np.array(

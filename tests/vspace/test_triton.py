@@ -25,11 +25,11 @@ from instant_ic.vspace.nerf import triton_kernels as kernels  # noqa: E402
 from instant_ic.vspace.nerf.field import FieldParameters, Lattice, TrainingScene, ray_sources  # noqa: E402
 from instant_ic.vspace.nerf.occupancy import build_occupancy  # noqa: E402
 from instant_ic.vspace.nerf.reference import TorchField  # noqa: E402
-from instant_ic.vspace.nerf.torch_device import TorchDevice, torch_priors  # noqa: E402
 from instant_ic.vspace.nerf.triton_device import TritonDevice  # noqa: E402
 from instant_ic.vspace.prior import prepare  # noqa: E402
 from instant_ic.vspace.view import perspective_rays  # noqa: E402
 from tests import box_room  # noqa: E402
+from tests.vspace.torch_device import TorchDevice, torch_priors  # noqa: E402
 
 DEVICE = "cuda" if CUDA else "cpu"
 F = np.float32

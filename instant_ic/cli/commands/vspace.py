@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-DEVICES = ("auto", "cpu", "cuda", "triton", "torch-cuda", "torch-cpu")
+DEVICES = ("auto", "cpu", "cuda")
 """Values of ``VirtualSpaceConfig.device``; that module is too heavy to import here."""
 SIZES = {"perspective": (640, 360), "equirect": (1024, 512)}
 """Default width and height of a view in pixels."""

@@ -233,7 +233,7 @@ class Rays:
 
 
 class Device(Protocol):
-    """A backend that trains and renders: ``numba_device``, ``torch_device`` or ``triton_device``.
+    """A backend that trains and renders: ``numba_device`` or ``triton_device``.
 
     Attributes:
         name: name of the hardware and the backend, for the status.

@@ -1,4 +1,4 @@
-"""Training and rendering by plain torch: on CUDA, and on CPUs where numba is missing (slow)."""
+"""Training and rendering by plain torch: what numba and Triton are compared with."""
 
 from __future__ import annotations
 
