@@ -272,8 +272,7 @@ def _drive(settings: TeleopSettings, index: int, method: str) -> TeleopDrive:
 def report(drives: Sequence[TeleopDrive], settings: TeleopSettings) -> dict[str, Any]:
     """Return the figures by method, the targets, and each drive without its tracks, ready for JSON."""
     by_method = {name: [d for d in drives if d.method == name] for name in settings.methods}
-    stop = by_method.get("stop")
-    methods = {name: figures.summary(own, stop if name != "stop" else None) for name, own in by_method.items() if own}
+    methods = {name: figures.summary(own) for name, own in by_method.items() if own}
     rows = [{key: value for key, value in asdict(drive).items() if key != "tracks"} for drive in drives]
     return {
         "seed": settings.seed,

@@ -87,9 +87,6 @@ class Switch:
             minus the distance that the shown robot drove between the arrivals of the two images.
         yaw_error_deg: between the headings of v-bot and r-bot just before the switch, as the stack knows them; the page
             rotates the images to these headings.
-        jump_m: the same, but minus the distance that the shown robot drove between the display times of the
-            two images, which include how long the camera's image had already been waiting. This is the jump that the
-            eye sees, before the page smooths it.
         psnr_db: between the two images; None if they were not rendered.
     """
 
@@ -97,7 +94,6 @@ class Switch:
     to_virtual: bool
     position_error_m: float
     yaw_error_deg: float
-    jump_m: float
     psnr_db: float | None = None
 
 
@@ -212,9 +208,9 @@ def find_switches(log: DriveLog) -> list[Switch]:
         if log.virtual[k] == log.virtual[k - 1]:
             continue
         pictures = pictures_at(log.pictures, log.time_s[k], log.virtual[k])
-        error, jump = (math.nan, math.nan) if pictures is None else picture_errors_m(*pictures, log)
+        error_m = math.nan if pictures is None else picture_error_m(*pictures, log)
         yaw_error_deg = abs(math.degrees(log.yaw_gap_rad[k - 1]))
-        found.append(Switch(log.time_s[k], bool(log.virtual[k]), error, yaw_error_deg, jump))
+        found.append(Switch(log.time_s[k], bool(log.virtual[k]), error_m, yaw_error_deg))
     return found
 
 
@@ -232,10 +228,10 @@ def pictures_at(pictures: list[Shown], time_s: float, to_virtual: bool) -> tuple
     return None
 
 
-def picture_errors_m(before: Shown, after: Shown, log: DriveLog) -> tuple[float, float]:
-    """Return how far two images that should coincide are apart: as the stack knows it, and as the eye sees it.
+def picture_error_m(before: Shown, after: Shown, log: DriveLog) -> float:
+    """Return how far two images that should coincide are apart, as the stack knows it.
 
-    The shown robot moves between the two images; its mean speed around the switch gives that distance.
+    The shown robot moves between the arrivals of the two images; its mean speed around the switch gives that distance.
     """
     speeds = shown_speeds(log)[:, 0]
     times = np.array(log.time_s)
@@ -243,9 +239,7 @@ def picture_errors_m(before: Shown, after: Shown, log: DriveLog) -> tuple[float,
     speed = float(speeds[near].mean()) if near.any() else 0.0
     heading = np.array([math.cos(before.heading), math.sin(before.heading)])
     between = speed * (after.came_s - before.came_s) * heading
-    shown_between = speed * (after.time_s - before.time_s) * heading
-    known = after.place - before.place
-    return float(np.hypot(*(known - between))), float(np.hypot(*(known - shown_between)))
+    return float(np.hypot(*(after.place - before.place - between)))
 
 
 def obstacles_met(log: DriveLog, centres: FloatArray) -> int:
@@ -283,12 +277,12 @@ def judge(drive: TeleopDrive, log: DriveLog, centres: FloatArray) -> None:
     }
 
 
-def summary(drives: list[TeleopDrive], stop: list[TeleopDrive] | None = None) -> dict[str, Any]:
-    """Return the figures of one method; ``stop`` are the drives of the robot that only stops, to compare times."""
+def summary(drives: list[TeleopDrive]) -> dict[str, Any]:
+    """Return the figures of one method."""
     switches = [switch for drive in drives for switch in drive.switches]
     into, back = ([s for s in switches if s.to_virtual == to_virtual] for to_virtual in (True, False))
     obstacles = sum(drive.obstacles for drive in drives)
-    figures: dict[str, Any] = {
+    return {
         "episodes": len(drives),
         "contacts": sum(drive.contacts for drive in drives),
         "completed_fraction": float(np.mean([drive.completed for drive in drives])),
@@ -300,7 +294,6 @@ def summary(drives: list[TeleopDrive], stop: list[TeleopDrive] | None = None) ->
         "switch_position_error_mean_m": _mean([s.position_error_m for s in switches]),
         "switch_yaw_error_deg": _max([s.yaw_error_deg for s in switches]),
         "switch_yaw_error_mean_deg": _mean([s.yaw_error_deg for s in switches]),
-        "switch_jump_m": _max([s.jump_m for s in switches]),
         "switch_psnr_db": _mean([s.psnr_db for s in switches if s.psnr_db is not None]),
         "switch_to_virtual_psnr_db": _mean([s.psnr_db for s in into if s.psnr_db is not None]),
         "switch_to_real_psnr_db": _mean([s.psnr_db for s in back if s.psnr_db is not None]),
@@ -314,11 +307,6 @@ def summary(drives: list[TeleopDrive], stop: list[TeleopDrive] | None = None) ->
         "seconds_mean": _mean([drive.seconds for drive in drives if drive.completed]),
         "path_ratio_mean": _mean([d.driven_m / d.way_m for d in drives if d.completed and d.way_m > 0]),
     }
-    if stop:
-        others = {drive.index: drive for drive in stop if drive.completed}
-        lost = [d.seconds - others[d.index].seconds for d in drives if d.completed and d.index in others]
-        figures["time_lost_against_stop_s"] = _mean(lost)
-    return figures
 
 
 def targets(figures: dict[str, Any]) -> dict[str, bool | None]:
