@@ -105,7 +105,7 @@ class FollowDrive:
 
     def __init__(self, seed: int, index: int) -> None:
         self.rng = np.random.default_rng([seed, index])
-        self.room = worlds.make_room(self.rng, low=index % 3 == 0)
+        self.room = worlds.make_room(self.rng, hidden=index % 3 == 0)
         self.mask = worlds.filled(self.room.shapes, self.room.size, 0.01, worlds.IN_THE_WAY_M)
         coarse = worlds.filled(self.room.shapes, self.room.size, 0.025, worlds.IN_THE_WAY_M)
         goal = np.array([*self.room.goal, 0.0])
@@ -388,7 +388,7 @@ def plot(episodes: list[Episode], seed: int, path: Path, most: int = 12) -> None
         _plot_episode(axes, episode, FollowDrive(seed, episode.index))
     for axes in grid.flat[len(shown) :]:
         axes.set_axis_off()
-    figure.suptitle("red: robot, blue: v-bot, dashed: shortest way; olive: low things", fontsize=9)
+    figure.suptitle("red: robot, blue: v-bot, dashed: shortest way; olive: low things, purple: hanging", fontsize=9)
     save_figure(figure, path)
 
 
@@ -398,7 +398,7 @@ def _plot_episode(axes: Any, episode: Episode, drive: FollowDrive) -> None:
     for shape, kind in zip(drive.room.shapes, drive.room.kinds, strict=True):
         cx, cy, half_x, half_y, yaw = shape[:5]
         corner, size = (cx - half_x, cy - half_y), (2 * half_x, 2 * half_y)
-        colour = ("0.25", "0.55", "tab:olive")[int(kind)]
+        colour = ("0.25", "0.55", "tab:olive", "tab:purple")[int(kind)]
         axes.add_patch(Rectangle(corner, *size, angle=math.degrees(yaw), rotation_point="center", lw=0, color=colour))
     if drive.optimum is not None:
         axes.plot(*drive.optimum[:, :2].T, "k--", lw=0.8)

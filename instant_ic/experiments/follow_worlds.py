@@ -1,4 +1,4 @@
-"""Rooms for ``ic evaluate follow``: walls with doors, boxes and low objects; and a simulated LiDAR.
+"""Rooms for ``ic evaluate follow``: walls with doors, boxes, low and hanging objects; and a simulated LiDAR.
 
 LiDAR and shortest path of the true footprint are computed from the shapes themselves and share no code with the code
 under evaluation.
@@ -30,9 +30,9 @@ IN_THE_WAY_M = (0.05, 1.25)
 """Height range in which an object blocks the robot: the crawler with its mast."""
 LENGTH_M, WIDTH_M = 0.60, 0.50
 WALL_M = 0.10
-BLIND_M = LIDAR_HEIGHT_M / math.tan(math.radians(15.0))
-"""Distance within which a standing VLP-16 may miss a low object: its lowest ring looks 15° down."""
-WALL, BOX, LOW = range(3)
+STEEPEST = math.tan(math.radians(15.0))
+"""Slope of the lowest and the highest ring."""
+WALL, BOX, LOW, HANGING = range(4)
 """Kinds of shapes."""
 
 
@@ -43,7 +43,7 @@ class Room:
     Attributes:
         size: (2,) metres; the room extends from (0, 0) to this corner.
         shapes: (N, 7) centre x, y, half length, half width, yaw, lowest and highest z.
-        kinds: (N,) ``WALL``, ``BOX`` or ``LOW``.
+        kinds: (N,) ``WALL``, ``BOX``, ``LOW`` or ``HANGING``.
         start: (3,) pose of the r-bot.
         goal: (2,) goal of the v-bot.
         route: (M, 2) the v-bot's path to the goal: around walls, through everything else.
@@ -79,8 +79,10 @@ def filled(shapes: FloatArray, size: FloatArray, cell_m: float, band: tuple[floa
     return OccupancyMask(cells, np.array([-margin, -margin]), cell_m)
 
 
-def make_room(rng: np.random.Generator, low: bool, attempts: int = 200) -> Room:
+def make_room(rng: np.random.Generator, hidden: bool, attempts: int = 200) -> Room:
     """Generate a random room whose goal is at least 5 m from the start, by a path around the walls.
+
+    ``hidden`` adds low and hanging objects, which the LiDAR sees only from some distance.
 
     Raises:
         ValueError: no such room found within ``attempts``.
@@ -91,18 +93,18 @@ def make_room(rng: np.random.Generator, low: bool, attempts: int = 200) -> Room:
         walls = np.array(shapes)
         plan = filled(walls, size, 0.05, IN_THE_WAY_M)
         for _ in range(int(rng.integers(6, 14))):
-            kind = int(rng.choice([BOX, BOX, BOX, LOW])) if low else BOX
+            kind = int(rng.choice([BOX, BOX, BOX, LOW, HANGING])) if hidden else BOX
             shapes.append(_thing(rng, size, kind))
             kinds.append(kind)
         every = np.array(shapes)
         # Remove objects at the start and the goal.
         start = np.array([*rng.uniform([0.8, 0.8], size - 0.8), rng.uniform(-math.pi, math.pi)])
         goal = rng.uniform([0.8, 0.8], size - 0.8)
-        # A robot that drove to its start has seen the low objects around it. A robot placed there has not: no beam
-        # reaches them, so no planner could avoid them.
+        # A robot that drove to its start has seen the low and hanging objects around it. A robot placed there has not:
+        # no beam reaches them, so no planner could avoid them.
         clear = np.array(
             [
-                k == WALL or (_away(s, start[:2]) > (BLIND_M if k == LOW else 0.6) and _away(s, goal) > 0.6)
+                k == WALL or (_away(s, start[:2]) > max(0.6, _blind_m(s, k)) and _away(s, goal) > 0.6)
                 for s, k in zip(every, kinds, strict=True)
             ]
         )
@@ -142,10 +144,19 @@ def _thing(rng: np.random.Generator, size: FloatArray, kind: int) -> Sequence[fl
     half_x, half_y = rng.uniform(0.1, 0.45), rng.uniform(0.1, 0.45)
     if rng.random() < 0.2:
         half_x = half_y = rng.uniform(0.03, 0.06)  # a post or a table leg
-    high = rng.uniform(0.08, 0.25) if kind == LOW else rng.uniform(0.4, 1.8)
+    heights = {
+        BOX: (0.0, rng.uniform(0.4, 1.8)),
+        LOW: (0.0, rng.uniform(0.08, 0.25)),
+        HANGING: (rng.uniform(0.75, 1.1), 2.0),
+    }
     if kind == LOW:
         half_x, half_y = max(half_x, 0.1), max(half_y, 0.1)
-    return (x, y, half_x, half_y, rng.uniform(-math.pi, math.pi), 0.0, high)
+    return (x, y, half_x, half_y, rng.uniform(-math.pi, math.pi), *heights[kind])
+
+
+def _blind_m(shape: Sequence[float] | FloatArray, kind: int) -> float:
+    """Return the distance within which a standing VLP-16 misses a low or hanging object; 0 for others."""
+    return {LOW: LIDAR_HEIGHT_M, HANGING: float(shape[5]) - LIDAR_HEIGHT_M}.get(kind, 0.0) / STEEPEST
 
 
 def _away(shape: Sequence[float] | FloatArray, point: FloatArray) -> float:

@@ -57,6 +57,13 @@ class TestLidar:
         top = ahead(worlds.look(room((5.5, 4.0, 0.5, 1.0, 0.0, 0.0, 0.4)).shapes, np.array([2.0, 4.0, 0.0]), Quiet()))  # type: ignore[arg-type]
         assert np.isclose(top[:, 0], 0.2 / math.tan(math.radians(3)), atol=1e-3).any()  # its top, 3.8 m off
 
+    def test_a_hanging_bar_is_in_the_way_and_seen_from_afar_only(self) -> None:
+        bar = (5.5, 4.0, 0.05, 1.0, 0.0, 0.9, 2.0)  # 0.3 m above the LiDAR: beams of 15° miss it within 1.1 m
+        assert worlds.filled(room(bar).shapes, np.array([10.0, 8.0]), 0.05, worlds.IN_THE_WAY_M).cells.any()
+        for x, seen in ((2.0, True), (4.8, False)):
+            points = ahead(worlds.look(room(bar).shapes, np.array([x, 4.0, 0.0]), Quiet()))  # type: ignore[arg-type]
+            assert (points[:, 2] > -worlds.LIDAR_HEIGHT_M + 0.01).any() == seen
+
 
 class TestShortestWay:
     @staticmethod

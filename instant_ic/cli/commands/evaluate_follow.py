@@ -15,7 +15,7 @@ def add_kind(kinds: Any) -> None:
     parser = verb(
         kinds, "follow", "simulate the r-bot following a v-bot through random rooms", run,
         "ic evaluate follow --episodes 50 --seed 0 --json follow.json --plot follow.png",
-        "Drive a v-bot to a goal through random rooms with walls, boxes and low obstacles. "
+        "Drive a v-bot to a goal through random rooms with walls, boxes, low and hanging obstacles. "
         "The r-bot follows with the robot's own costmap, planner, follower and collision monitor, "
         "under slip, command delay, sensor noise and pose drift. Reports contacts, goals reached, path length "
         "relative to the shortest path, and CPU time of each part. The same seed gives the same drives.",
