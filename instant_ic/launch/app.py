@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+import functools
 import os
 import sys
-import time
 from collections.abc import Sequence
 from contextlib import ExitStack
 from pathlib import Path
@@ -22,7 +22,6 @@ from instant_ic.launch.supervisor import Supervisor
 from instant_ic.util.estop_state import RunMark
 from instant_ic.util.pace import PaceFiles, describe, remove_files
 
-_VIEW_PERIOD_S = 0.5
 _WAITING_LINES = 2000  # how many lines a terminal may lag behind
 
 
@@ -58,7 +57,9 @@ def run_stack(
             locks.enter_context(stack_lock(folder, description.file.name))
             registry.sweep(folder)
             locks.enter_context(RunMark(folder))
-        output = StackOutput(description, run_dir, sys.stdout.isatty() if live is None else live, verbose)
+        output = StackOutput(
+            [node.label for node in description.nodes], sys.stdout.isatty() if live is None else live, verbose
+        )
         status = 1
         try:
             count = f"{len(description.nodes)} node{'' if len(description.nodes) == 1 else 's'}"
@@ -69,7 +70,9 @@ def run_stack(
             elif pace is not None and pace != 1.0:
                 PaceFiles(folders, pace)
                 output.event(f"{describe(pace, adapts=False)}, for simulated devices only")
-            status = Supervisor(description.nodes, run_dir, output, make_health=output.make_health).run()
+            # The health monitor is made once the processes are started, so that they need not wait for it.
+            make_health = functools.partial(HealthMonitor, description.nodes, run_dir)
+            status = Supervisor(description.nodes, run_dir, output, make_health=make_health).run()
         finally:
             for folder in folders:
                 registry.sweep(folder)
@@ -80,23 +83,12 @@ def run_stack(
 class StackOutput:
     """The screen, on a thread of its own so that a blocked terminal does not hold up the stack."""
 
-    def __init__(self, description: LaunchDescription, run_dir: Path, live: bool, verbose: bool) -> None:
-        self.health: HealthMonitor | None = None
-        """None until the processes have been started."""
+    def __init__(self, labels: Sequence[str], live: bool, verbose: bool) -> None:
         self.pacing: Pacing | None = None
-        self._description, self._run_dir = description, run_dir
-        self._screen = StackScreen([node.label for node in description.nodes], live, verbose=verbose)
-        self._outlet = Outlet("screen", _WAITING_LINES)
+        self._screen = StackScreen(labels, live, verbose=verbose)
+        self._outlet = Outlet(_WAITING_LINES)
         self._outlet.put(self._screen.start, always=True)
-        self._ending = False
         self._dropped_lines = 0
-        self._next_view_s = 0.0
-        self._reached = 0
-
-    def make_health(self) -> HealthMonitor:
-        """Create the health monitor, once the processes have been started, so that they need not wait for it."""
-        self.health = HealthMonitor(self._description.nodes, self._run_dir)
-        return self.health
 
     def node_line(self, node: str, text: str) -> None:
         """Show a line of a node, unless the terminal lags too far behind."""
@@ -111,45 +103,12 @@ class StackOutput:
         """Show an event of the launcher."""
         self._outlet.put(self._screen.event, text, bad, always=True)
 
-    def refresh(self, processes: Sequence[ManagedProcess]) -> None:
-        """Adapt the pace, and update the view twice a second and at each step of the start."""
-        running = self.health if not self._ending else None
-        if self.pacing is not None and running is not None:
-            self.pacing.step(running)
-        reached = running.reached if running is not None else self._reached
-        if time.monotonic() >= self._next_view_s or reached > self._reached:
-            self._reached = reached
-            self._next_view_s = time.monotonic() + _VIEW_PERIOD_S
-            self._outlet.put(self._screen.refresh, self.view(processes))
-
-    def stopping(self) -> None:
-        """Show from now on that the stack ends."""
-        self._ending = True
-        self._next_view_s = 0.0
-
-    def view(self, processes: Sequence[ManagedProcess]) -> StackView:
-        """Return the present state for the screen; also publish it for other tools."""
-        health = self.health
-        if health is None:
-            rows = tuple(node_row(process, None, []) for process in processes)
-            return StackView(rows, looked=False, ending=self._ending)
-        faults = health.topic_faults()
-        if not self._ending:
-            down = (ProcessState.FAILED, ProcessState.WAITING)
-            health.publish({p.spec.label: p.state.value for p in processes if p.state in down}, faults)
-        # Nothing waits for an optional node that has ended: a recorder whose disk is full.
-        over = (ProcessState.FAILED, ProcessState.ENDED)
-        gone = {p.spec.label for p in processes if p.state in over and not p.spec.respawn}
-        return StackView(
-            rows=tuple(node_row(process, health, faults) for process in processes),
-            missing=tuple(label for label in health.nodes_missing() if label not in gone),
-            waiting=tuple(health.waiting_for()),
-            # Only a terminal gets the token: others may read the file or pipe that standard output goes to.
-            addresses=dict(health.addresses(with_token=sys.stdout.isatty())),
-            faults=tuple(f"{fault.topic} of {fault.label}: {fault.text}" for fault in faults),
-            ending=self._ending,
-            pace=self.pacing.text if self.pacing is not None else "",
-        )
+    def refresh(self, processes: Sequence[ManagedProcess], health: HealthMonitor | None, ending: bool) -> None:
+        """Adapt the pace, and show the present state."""
+        if self.pacing is not None and health is not None and not ending:
+            self.pacing.step(health)
+        pace = self.pacing.text if self.pacing is not None else ""
+        self._outlet.put(self._screen.refresh, stack_view(processes, health, ending, pace))
 
     def close(self, status: int) -> None:
         """Show the remaining lines and remove the table; on a blocked terminal the process exits with ``status``."""
@@ -160,6 +119,32 @@ class StackOutput:
             os._exit(status)
         if self._outlet.broken is not None:  # ic launch ... | head: the rest of the buffer has no destination
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+
+
+def stack_view(
+    processes: Sequence[ManagedProcess], health: HealthMonitor | None, ending: bool = False, pace: str = ""
+) -> StackView:
+    """Return the present state for the screen; also publish it for other tools."""
+    if health is None:
+        rows = tuple(node_row(process, None, []) for process in processes)
+        return StackView(rows, looked=False, ending=ending)
+    faults = health.topic_faults()
+    if not ending:
+        down = (ProcessState.FAILED, ProcessState.WAITING)
+        health.publish({p.spec.label: p.state.value for p in processes if p.state in down}, faults)
+    # Nothing waits for an optional node that has ended: a recorder whose disk is full.
+    over = (ProcessState.FAILED, ProcessState.ENDED)
+    gone = {p.spec.label for p in processes if p.state in over and not p.spec.respawn}
+    return StackView(
+        rows=tuple(node_row(process, health, faults) for process in processes),
+        missing=tuple(label for label in health.nodes_missing() if label not in gone),
+        waiting=tuple(health.waiting_for()),
+        # Only a terminal gets the token: others may read the file or pipe that standard output goes to.
+        addresses=dict(health.addresses(with_token=sys.stdout.isatty())),
+        faults=tuple(f"{fault.topic} of {fault.label}: {fault.text}" for fault in faults),
+        ending=ending,
+        pace=pace,
+    )
 
 
 def node_row(process: ManagedProcess, monitor: HealthMonitor | None, faults: Sequence[TopicFault]) -> NodeRow:

@@ -156,11 +156,6 @@ class HealthMonitor:
         health = self.nodes.get(spec.label)
         return health.seen_s if health is not None and health.pid == pid and health.up else None
 
-    @property
-    def reached(self) -> int:
-        """Steps of the start so far: nodes that run, and what :meth:`waiting_for` no longer lists."""
-        return len(self._reached) + sum(health.up for health in self.nodes.values())
-
     def nodes_missing(self) -> list[str]:
         """Return the nodes that have not reported yet that they run."""
         return [s.label for s in self._specs if s.label not in self.nodes or not self.nodes[s.label].up]

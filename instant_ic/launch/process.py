@@ -8,15 +8,17 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import IO
 
 from instant_ic.launch.description import NodeSpec
-from instant_ic.launch.outlet import NodeLog, Outlet
+from instant_ic.launch.hang import HeartbeatSilence
+from instant_ic.launch.node_log import NodeLog
 from instant_ic.launch.reaper import VARIABLE
 
 MAX_LINE_BYTES = 1 << 16
@@ -33,8 +35,8 @@ Schedule = Sequence[tuple[signal.Signals, float]]
 
 _CHILD = Path(__file__).with_name("child.py")
 _BURST_S = 4.0
-_PIPE_BYTES = 1 << 20  # a short delay of the launcher must not block the nodes
-_CHUNKS_A_CALL = 4
+_FLOOD_PAUSE_S = 0.005  # between two reads of output that is dropped: leaves the CPU to the others
+_PIPE_BYTES = 1 << 20  # a short delay of the launcher or its disk must not block the nodes
 
 
 def dies_with_us() -> tuple[str, ...]:
@@ -90,15 +92,43 @@ class RespawnLimit:
         return f"{self.MAX_STARTS} restarts within {self.WINDOW_S:.0f} s"
 
 
+class OutputLimit:
+    """Passes on what a node writes, up to ``OUTPUT_BYTES_PER_S``; a note stands for what is dropped."""
+
+    def __init__(self) -> None:
+        self._budget = _BURST_S * OUTPUT_BYTES_PER_S
+        self._budget_s = time.monotonic()
+        self._dropped_bytes = 0
+
+    def pass_on(self, data: bytes) -> bytes:
+        """Return the data, after a note if some was dropped before; empty if it is dropped."""
+        now_s = time.monotonic()
+        self._budget += (now_s - self._budget_s) * OUTPUT_BYTES_PER_S
+        self._budget = min(self._budget, _BURST_S * OUTPUT_BYTES_PER_S)
+        self._budget_s = now_s
+        # Once output is dropped, the budget must first recover by one second: one note per second, not per chunk.
+        if self._budget < (OUTPUT_BYTES_PER_S if self._dropped_bytes else 0):
+            self._dropped_bytes += len(data)
+            return b""
+        self._budget -= len(data)
+        return self.note() + data
+
+    def note(self) -> bytes:
+        """Return a line about dropped output, if there is some, and forget it."""
+        dropped, self._dropped_bytes = self._dropped_bytes, 0
+        text = f"\n[launch: {dropped} bytes dropped: more than {OUTPUT_BYTES_PER_S} a second]\n"
+        return text.encode() if dropped else b""
+
+
 class ManagedProcess:
-    """A process in a session of its own, with its log file.
+    """A process in a session of its own, with its log file and a thread that forwards its output.
 
     Args:
         spec: the node to run.
         run_dir: run directory of the stack.
         mark: text that the process and everything it starts carry in their environment.
-        disk: thread that writes the log.
-        report: called with texts about the log.
+        show_line: called with each line of its output, on the forwarding thread.
+        report: called with texts about the log, on any thread.
     """
 
     def __init__(
@@ -106,7 +136,7 @@ class ManagedProcess:
         spec: NodeSpec,
         run_dir: Path,
         mark: str,
-        disk: Outlet,
+        show_line: Callable[[str, str], None],
         report: Callable[[str], None],
     ) -> None:
         self.spec = spec
@@ -120,18 +150,15 @@ class ManagedProcess:
         """Monotonic time from which it should run."""
         self.started_s = 0.0
         """Monotonic time of its last start."""
-        self.output_closed = False
+        self.silence = HeartbeatSilence()
         self._run_dir = spec.run_dir or run_dir
         self.log_path = self._run_dir / "log" / f"{spec.name}.log"
+        self._log = NodeLog(self.log_path, report)
+        self._show_line = show_line
         self._popen: subprocess.Popen[bytes] | None = None
-        self._partial = b""
+        self._forwarder: threading.Thread | None = None
         self._ending: deque[tuple[signal.Signals, float]] | None = None
         self._next_signal_s = 0.0
-        self._disk = disk
-        self._log = NodeLog(self.log_path, report)
-        self._budget = _BURST_S * OUTPUT_BYTES_PER_S
-        self._budget_s = time.monotonic()
-        self._dropped_bytes = 0
 
     @property
     def pid(self) -> int | None:
@@ -139,22 +166,15 @@ class ManagedProcess:
         return self._popen.pid if self._popen is not None else None
 
     @property
-    def output(self) -> IO[bytes] | None:
-        """Non-blocking pipe with its output, while it runs."""
-        return self._popen.stdout if self._popen is not None else None
-
-    @property
-    def flooding(self) -> bool:
-        """True while some of its output is being dropped."""
-        return self._dropped_bytes > 0
-
-    @property
     def ending(self) -> bool:
         """True while it is being ended."""
         return self._ending is not None
 
-    def start(self) -> None:
+    def start(self, on_output_end: Callable[[], None]) -> None:
         """Start the process.
+
+        Args:
+            on_output_end: called on another thread when its output ends, which is soon before its own end.
 
         Raises:
             OSError: the kernel refuses it.
@@ -171,20 +191,47 @@ class ManagedProcess:
             VARIABLE: ":".join(marks),
         }
         self.exit_status, self.reason, self._ending = None, "", None
+        self.silence = HeartbeatSilence()
         self._popen = subprocess.Popen(
             (*dies_with_us(), *self.spec.command),
+            bufsize=0,
             stdin=subprocess.DEVNULL,
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,
             env=environment,
             start_new_session=True,
         )
-        assert self._popen.stdout is not None
-        os.set_blocking(self._popen.stdout.fileno(), False)
+        output = self._popen.stdout
+        assert output is not None
         with suppress(OSError):  # the user's pipe memory is used up: keep the usual 64 kB
-            fcntl.fcntl(self._popen.stdout.fileno(), fcntl.F_SETPIPE_SZ, _PIPE_BYTES)
-        self.state, self.output_closed = ProcessState.RUNNING, False
-        self.started_s = time.monotonic()
+            fcntl.fcntl(output.fileno(), fcntl.F_SETPIPE_SZ, _PIPE_BYTES)
+        self.state, self.started_s = ProcessState.RUNNING, time.monotonic()
+        self._forwarder = threading.Thread(
+            target=self._forward, args=(output, on_output_end), name=f"output of {self.spec.label}", daemon=True
+        )
+        self._forwarder.start()
+
+    def _forward(self, output: IO[bytes], on_end: Callable[[], None]) -> None:
+        """Forward output to log and screen until all processes that hold the pipe have ended."""
+        limit, partial = OutputLimit(), b""
+        with output:
+            while data := output.read(MAX_LINE_BYTES):
+                passed = limit.pass_on(data)
+                if not passed:
+                    time.sleep(_FLOOD_PAUSE_S)
+                    continue
+                self._log.write(passed)
+                *lines, partial = (partial + passed).split(b"\n")
+                if len(partial) >= MAX_LINE_BYTES:
+                    lines, partial = [*lines, partial], b""
+                for line in lines:
+                    self._show_line(self.spec.label, line.decode(errors="replace").rstrip("\r"))
+        if note := limit.note():
+            self._log.write(note)
+        if partial:
+            self._show_line(self.spec.label, partial.decode(errors="replace"))
+        self._log.close()
+        on_end()
 
     def send(self, signum: signal.Signals) -> None:
         """Send a signal to the whole process group; SIGABRT only to the process itself, which then prints its stack."""
@@ -216,71 +263,26 @@ class ManagedProcess:
         """Return whether all signals have been sent and their waits are over."""
         return self._ending is not None and not self._ending and now_s >= self._next_signal_s
 
-    def read_lines(self, now_s: float) -> Iterator[str]:
-        """Yield new lines of its output; all of it goes into the log file.
-
-        Reads few chunks per call, so that endless output cannot keep the launcher from the other processes, and at most
-        the output limit.
-        """
-        self._budget += (now_s - self._budget_s) * OUTPUT_BYTES_PER_S
-        self._budget = min(self._budget, _BURST_S * OUTPUT_BYTES_PER_S)
-        self._budget_s = now_s
-        for _ in range(_CHUNKS_A_CALL):
-            if self.output is None:
-                return
-            try:
-                data = os.read(self.output.fileno(), MAX_LINE_BYTES)
-            except BlockingIOError:
-                return
-            if not data:
-                self.output_closed = True
-                return
-            # Once output is dropped, the budget must first recover by one second: one note per second, not per chunk.
-            if self._budget < (OUTPUT_BYTES_PER_S if self._dropped_bytes else 0):
-                self._dropped_bytes += len(data)
-                continue
-            self._budget -= len(data)
-            data = self._note() + data
-            if not self._disk.put(self._log.write, data, size=len(data)):
-                self._dropped_bytes += len(data)  # the disk is too slow
-            *lines, self._partial = (self._partial + data).split(b"\n")
-            if len(self._partial) >= MAX_LINE_BYTES:
-                lines, self._partial = [*lines, self._partial], b""
-            yield from (line.decode(errors="replace").rstrip("\r") for line in lines)
-
-    def _note(self) -> bytes:
-        """Return a line about dropped output, if there is some, and forget it."""
-        dropped, self._dropped_bytes = self._dropped_bytes, 0
-        text = f"\n[launch: {dropped} bytes dropped: more than {OUTPUT_BYTES_PER_S} a second]\n"
-        return text.encode() if dropped else b""
-
     def has_ended(self) -> bool:
         """Return whether its own process has ended. It stays unreaped, so that its group id cannot be reused."""
         if self._popen is None:
             return False
         return os.waitid(os.P_PID, self._popen.pid, os.WEXITED | os.WNOHANG | os.WNOWAIT) is not None
 
-    def reap(self) -> Iterator[str]:
-        """After ``has_ended``: kill the rest of its group, set ``exit_status`` and yield the last lines."""
+    def reap(self) -> None:
+        """After ``has_ended``: kill the rest of its group, and set ``exit_status``."""
         assert self._popen is not None
         self.send(signal.SIGKILL)
-        now_s = time.monotonic()
-        for _ in range(8):
-            yield from self.read_lines(now_s)
-        if self._dropped_bytes:
-            self._disk.put(self._log.write, self._note())
-        if self._partial:
-            yield self._partial.decode(errors="replace")
-            self._partial = b""
         self.exit_status = self._popen.wait()
-        if self._popen.stdout is not None:
-            self._popen.stdout.close()
         self._popen, self._ending = None, None
         self.state = ProcessState.ENDED if self.exit_status == 0 and not self.reason else ProcessState.FAILED
 
-    def close(self) -> None:
-        """Close the log file once everything waiting has been written."""
-        self._disk.put(self._log.close, always=True)
+    def finish_output(self, timeout_s: float) -> bool:
+        """Wait until the output of the ended process has been forwarded; return whether all of it has."""
+        if self._forwarder is None:
+            return True
+        self._forwarder.join(max(0.0, timeout_s))
+        return not self._forwarder.is_alive()
 
 
 def describe_exit(status: int) -> str:

@@ -2,22 +2,20 @@
 
 from __future__ import annotations
 
-import selectors
 import signal
 import subprocess
 import sys
+import threading
 import time
 import uuid
-from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Protocol
 
 from instant_ic.launch.description import NodeSpec
-from instant_ic.launch.hang import BUSY_FACTOR, HeartbeatSilence, is_traced
+from instant_ic.launch.hang import BUSY_FACTOR, is_traced
 from instant_ic.launch.health import HealthMonitor
-from instant_ic.launch.outlet import Outlet
 from instant_ic.launch.process import USAGE_STATUS, ManagedProcess, ProcessState, Schedule, describe_exit
 from instant_ic.launch.reaper import kill_marked
 from instant_ic.util.closing import on_end_signal
@@ -33,13 +31,14 @@ HANG_SCHEDULE: Schedule = ((signal.SIGABRT, 2.0), (signal.SIGKILL, 1.0))
 """Signals to a hung node: the first makes it write the stack of every thread, the second ends it."""
 
 _HURRIED_SCHEDULE: Schedule = ((signal.SIGKILL, 1.0),)
-_ROUND_S = 0.25  # also the time to react to Ctrl-C; output of a node, and its end, come at once
-_LOG_BYTES = 32 << 20  # how much may wait for the disk
+_ROUND_S = 0.25  # also the time to react to Ctrl-C; the end of a node is noticed at once
+_LAST_LINES_S = 0.5
+_LAST_LOG_S = 2.0
 _REAPER = Path(__file__).with_name("reaper.py")
 
 
 class SupervisorOutput(Protocol):
-    """Destination of the supervisor's output."""
+    """Destination of the supervisor's output. Lines come from a thread for each node, events from these threads too."""
 
     def node_line(self, node: str, text: str) -> None:
         """Show a line of a node's output."""
@@ -47,11 +46,8 @@ class SupervisorOutput(Protocol):
     def event(self, text: str, bad: bool = False) -> None:
         """Show an event reported by the supervisor."""
 
-    def refresh(self, processes: Sequence[ManagedProcess]) -> None:
-        """Show the present state; called several times a second."""
-
-    def stopping(self) -> None:
-        """Note that the end begins."""
+    def refresh(self, processes: Sequence[ManagedProcess], health: HealthMonitor | None, ending: bool) -> None:
+        """Show the present state; called several times a second, with ``health`` once the processes are started."""
 
 
 class Supervisor:
@@ -80,14 +76,13 @@ class Supervisor:
         self._stop_schedule = tuple(stop_schedule)
         self._output = output
         self._mark = uuid.uuid4().hex
-        self._disk = Outlet("log files", _LOG_BYTES)
-        self._log_events: deque[str] = deque()
-        """Texts from the thread that writes the logs."""
-        self.processes = [ManagedProcess(n, run_dir, self._mark, self._disk, self._log_events.append) for n in nodes]
+        self.processes = [
+            ManagedProcess(node, run_dir, self._mark, output.node_line, lambda text: output.event(text, bad=True))
+            for node in nodes
+        ]
         self._make_health = make_health
         self._health: HealthMonitor | None = None
-        self._silences = {process: HeartbeatSilence() for process in self.processes}
-        self._selector = selectors.DefaultSelector()
+        self._output_ended = threading.Event()
         self._stop = False
         self._hurry = False
         self._status = 0
@@ -119,12 +114,9 @@ class Supervisor:
                 finally:
                     self._stop_all()
         finally:
-            self._selector.close()
-            for process in self.processes:
-                process.close()
-            if not self._disk.close():
+            until_s = time.monotonic() + _LAST_LOG_S
+            if not all(process.finish_output(until_s - time.monotonic()) for process in self.processes):
                 self._output.event("the rest of the logs could not be written", bad=True)
-            self._forward_log_events()
             if self._health is not None:
                 self._health.close()
         return self._status
@@ -156,19 +148,15 @@ class Supervisor:
     # -- one round -------------------------------------------------------------------------------
 
     def _step(self, wait_s: float) -> None:
-        """Forward the nodes' output, then move every process towards its wanted state."""
-        flooded = False
-        for key, _ in self._selector.select(wait_s):
-            flooded |= self._forward_output(key.data)
+        """Wait shortly, then move every process towards its wanted state."""
+        self._output_ended.wait(wait_s)
+        self._output_ended.clear()
         if self._health is not None:
             self._health.poll()
         self._reconcile(time.monotonic())
         if self._health is None and self._make_health is not None and not self._stop:
             self._health = self._make_health()  # after the starts, so that no process waits for it
-        self._forward_log_events()
-        self._output.refresh(self.processes)
-        if flooded:
-            time.sleep(0.005)  # a process writes without end: leave the CPU to the others
+        self._output.refresh(self.processes, self._health, self._stop)
 
     def _reconcile(self, now_s: float) -> None:
         since_s, self._last_look_s = now_s - self._last_look_s, now_s
@@ -194,7 +182,7 @@ class Supervisor:
         """End a process that has stopped sending heartbeats."""
         if self._health is None or process.pid is None:
             return
-        limit_s, silence = process.spec.hang_timeout_s, self._silences[process]
+        limit_s, silence = process.spec.hang_timeout_s, process.silence
         silence.look(self._health.beat_s(process.spec, process.pid), process.pid, since_s)
         if silence.beat_s is None or limit_s <= 0 or silence.lasts_s < limit_s or is_traced(process.pid):
             return
@@ -211,43 +199,21 @@ class Supervisor:
         process.begin_end(HANG_SCHEDULE, reason)
 
     def _start(self, process: ManagedProcess) -> None:
-        self._silences[process] = HeartbeatSilence()
         try:
-            process.start()
+            process.start(self._output_ended.set)
         except (OSError, ValueError) as error:  # ValueError: an argument contains a zero byte
             process.state, process.exit_status = ProcessState.FAILED, 127
             self._output.event(f"{process.spec.label} cannot be started: {error}", bad=True)
             self._after_end(process)
-            return
-        assert process.output is not None
-        self._selector.register(process.output, selectors.EVENT_READ, process)
-
-    def _forward_log_events(self) -> None:
-        while self._log_events:
-            self._output.event(self._log_events.popleft(), bad=True)
-
-    def _forward_output(self, process: ManagedProcess) -> bool:
-        """Forward a process's output; return whether some of it was dropped."""
-        for line in process.read_lines(time.monotonic()):
-            self._output.node_line(process.spec.label, line)
-        if process.output_closed:
-            self._forget_output(process)
-        return process.flooding
-
-    def _forget_output(self, process: ManagedProcess) -> None:
-        if process.output is not None:
-            with suppress(KeyError):  # its output has been closed before
-                self._selector.unregister(process.output)
 
     def _reap(self, process: ManagedProcess) -> None:
-        self._forget_output(process)
-        for line in process.reap():
-            self._output.node_line(process.spec.label, line)
+        process.reap()
         if self._stop:
             return
         # Children in a session of their own, outside the process group, would keep its devices and ports open.
         for pid, command in kill_marked(process.mark).items():
             self._output.event(f"killed a process that {process.spec.label} left behind: {pid} {command}", bad=True)
+        process.finish_output(_LAST_LINES_S)  # shown before the event
         self._after_end(process)
 
     def _after_end(self, process: ManagedProcess) -> None:
@@ -280,7 +246,6 @@ class Supervisor:
 
     def _stop_all(self) -> None:
         self._stop = True
-        self._output.stopping()
         running = [process for process in self.processes if process.state is ProcessState.RUNNING]
         if running:
             self._output.event(f"stopping {len(running)} node{'s' if len(running) > 1 else ''}")

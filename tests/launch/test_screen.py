@@ -15,7 +15,7 @@ from instant_ic.bus.heartbeat import Flow, Heartbeat, from_message
 from instant_ic.bus.local_transport import LocalTransport
 from instant_ic.bus.registry import NodeInfo, prepare
 from instant_ic.launch import NodeSpec
-from instant_ic.launch.app import StackOutput, node_row
+from instant_ic.launch.app import node_row, stack_view
 from instant_ic.launch.health import HealthMonitor, TopicFault, console_address
 from instant_ic.launch.node_table import NodeRow, TopicRow
 from instant_ic.launch.process import ProcessState
@@ -281,10 +281,8 @@ def test_row_of_a_node_from_its_process_its_heartbeat_and_its_topics() -> None:
     )
 
 
-def test_an_optional_node_that_has_ended_is_not_waited_for(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_optional_node_that_has_ended_is_not_waited_for() -> None:
     recorder, slam = NodeSpec("recorder", "bag_recorder", ()), NodeSpec("slam", "grid_slam", (), respawn=True)
-    description: Any = SimpleNamespace(nodes=[recorder, slam])
-    output = StackOutput(description, tmp_path, live=False, verbose=False)
     monitor: Any = SimpleNamespace(
         nodes={},
         topic_faults=list,
@@ -293,10 +291,8 @@ def test_an_optional_node_that_has_ended_is_not_waited_for(tmp_path: Path, capsy
         addresses=lambda with_token: {},
         publish=lambda down, faults: None,
     )
-    output.health = monitor
     processes: Any = [
         SimpleNamespace(spec=spec, state=ProcessState.FAILED, limit=SimpleNamespace(retries=0), reason="")
         for spec in (recorder, slam)
     ]
-    assert output.view(processes).missing == ("slam",)
-    output.close(0)
+    assert stack_view(processes, monitor).missing == ("slam",)

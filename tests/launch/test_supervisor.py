@@ -14,9 +14,10 @@ import psutil
 import pytest
 
 from instant_ic.cli.main import main
-from instant_ic.launch import NodeSpec, outlet, process
+from instant_ic.launch import NodeSpec, node_log, process
 from instant_ic.launch.hang import HeartbeatSilence
-from instant_ic.launch.outlet import NodeLog, Outlet
+from instant_ic.launch.node_log import NodeLog
+from instant_ic.launch.outlet import Outlet
 from instant_ic.launch.process import ManagedProcess, ProcessState, RespawnLimit
 from instant_ic.launch.rundir import StackRunningError, stack_lock
 from instant_ic.launch.supervisor import STOP_SCHEDULE, Supervisor
@@ -61,14 +62,11 @@ class Recorder:
     def event(self, text: str, bad: bool = False) -> None:
         self.events.append(text)
 
-    def refresh(self, processes: Sequence[ManagedProcess]) -> None:
+    def refresh(self, processes: Sequence[ManagedProcess], *_: object) -> None:
         assert self.supervisor is not None
         self.timed_out = time.monotonic() > self.limit_s
         if self.timed_out or self.act(self, {p.spec.name: p for p in processes}):
             self.supervisor.request_stop()
-
-    def stopping(self) -> None:
-        pass
 
     def of(self, node: str) -> list[str]:
         return [text for name, text in self.lines if name == node]
@@ -235,8 +233,7 @@ from instant_ic.launch.supervisor import Supervisor
 class Output:
     def node_line(self, node, text): print(text, flush=True)
     def event(self, text, bad=False): pass
-    def refresh(self, processes): pass
-    def stopping(self): pass
+    def refresh(self, *_): pass
 node = NodeSpec("forker", "forker", (sys.executable, "-c", {FORKING!r}))
 Supervisor([node], pathlib.Path({str(run_dir)!r}), Output()).run()
 """
@@ -379,7 +376,7 @@ def test_a_node_that_floods_its_output_holds_up_nobody(run_dir: Path, monkeypatc
 def test_a_terminal_that_takes_nothing_does_not_hold_up_the_launcher() -> None:
     """Ctrl-S, or a dead ssh connection: who waits for it would let the nodes' pipes fill, and the nodes stand still."""
     held, done = threading.Event(), threading.Event()
-    terminal = Outlet("terminal", limit=10)
+    terminal = Outlet(limit=10)
     terminal.put(lambda: (held.wait(240), None)[1])
     taken = [terminal.put(lambda: None) for _ in range(1000)]
     assert not held.is_set()  # nobody waited for the terminal
@@ -394,7 +391,7 @@ def test_output_whose_reader_has_gone_is_given_up() -> None:
     def broken() -> None:
         raise BrokenPipeError(32, "Broken pipe")
 
-    terminal = Outlet("terminal", limit=10)
+    terminal = Outlet(limit=10)
     terminal.put(broken)
     assert terminal.close(30)
     assert isinstance(terminal.broken, BrokenPipeError) and not terminal.put(lambda: None)
@@ -433,7 +430,7 @@ def test_full_disk_for_a_log_is_reported_once(tmp_path: Path, monkeypatch: pytes
     log = NodeLog(path, reports.append)
     with monkeypatch.context() as full_disk:
         path.write_bytes(b"")
-        full_disk.setattr(outlet, "open_file", lambda path, flags: os.open("/dev/full", os.O_WRONLY))
+        full_disk.setattr(node_log, "open_file", lambda path, flags: os.open("/dev/full", os.O_WRONLY))
         for _ in range(3):
             log.write(b"lost line\n")
     [report] = reports

@@ -14,7 +14,7 @@ from instant_ic.bag.recorder import BagRecorderConfig, Recorder
 from instant_ic.bag.recover import recover
 from instant_ic.bag.writer import BagWriter
 from instant_ic.bridge.host_keys import KeyStore
-from instant_ic.launch.outlet import NodeLog
+from instant_ic.launch.node_log import NodeLog
 from instant_ic.msg import Bool, serialize
 from instant_ic.util import private
 

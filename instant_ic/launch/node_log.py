@@ -1,0 +1,78 @@
+"""Log file of a node."""
+
+from __future__ import annotations
+
+import errno
+import os
+from collections.abc import Callable
+from contextlib import suppress
+from io import FileIO
+from pathlib import Path
+
+from instant_ic.util.private import make_folder, open_file
+
+
+class NodeLog:
+    """A node's log file, mode 0600; the previous run's file is kept. Errors are reported once and never raised.
+
+    Args:
+        path: the log file.
+        report: called with a text when writing fails and when it works again; runs on the writing thread.
+        max_bytes: a larger file is renamed to ``.log.1``, and a new one is started.
+    """
+
+    def __init__(self, path: Path, report: Callable[[str], None], max_bytes: int = 64 << 20) -> None:
+        self.path = path
+        self._report = report
+        self._max_bytes = max_bytes
+        self._file: FileIO | None = None
+        self._size = 0
+        self._failed = False
+        self._rotate()
+
+    def write(self, data: bytes) -> None:
+        """Append to the file."""
+        try:
+            if self._size + len(data) > self._max_bytes:
+                self.close()
+                self._rotate()
+            if self._file is None:
+                self._open()
+            self._put(data)
+        except OSError as error:
+            self.close()
+            if not self._failed:
+                self._report(f"{self.path} cannot be written ({error.strerror}). Free some space; its lines are lost.")
+            self._failed = True
+            return
+        if self._failed:
+            self._failed = False
+            self._report(f"{self.path} can be written again; lines are missing in it")
+
+    def close(self) -> None:
+        """Close the file; a later write opens it again."""
+        if self._file is not None:
+            file, self._file = self._file, None
+            with suppress(OSError):  # write() has already reported a full disk
+                file.close()
+
+    def _put(self, data: bytes) -> None:
+        assert self._file is not None
+        written = self._file.write(data)
+        self._size += written or 0
+        if written != len(data):
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    def _open(self) -> None:
+        make_folder(self.path.parent, exist_ok=True)
+        self._file = os.fdopen(open_file(self.path, os.O_WRONLY | os.O_APPEND | os.O_CREAT), "ab", buffering=0)
+        self._size = self.path.stat().st_size
+
+    def _rotate(self) -> None:
+        self._size = 0
+        try:
+            self.path.replace(self.path.with_suffix(".log.1"))
+        except FileNotFoundError:
+            pass
+        except OSError as error:
+            self._report(f"{self.path} cannot be renamed ({error.strerror}); new output is appended to it")
