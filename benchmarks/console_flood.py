@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 from reporting import parser_for, report, summary
 
-from instant_ic.console import ConsoleClient, ConsoleServer, ConsoleServerConfig
+from instant_ic.console import ConsoleBackend, ConsoleClient, ConsoleServer, ConsoleServerConfig
 from instant_ic.console.access import AccessConfig
 from instant_ic.console.drive import DriveConfig
 
@@ -42,7 +42,7 @@ class Patient(DriveConfig):
 PATIENT = Patient(watchdog_s=30.0, lease_timeout_s=60.0, beat_timeout_s=30.0, max_command_age_s=60.0)
 
 
-class StopRecorder:
+class StopRecorder(ConsoleBackend):
     """A backend of the console that records emergency stops and ignores the operator's other actions."""
 
     def __init__(self) -> None:
@@ -53,13 +53,10 @@ class StopRecorder:
         if stop:
             self.stops_s.append(time.monotonic())
 
-    def __getattr__(self, name: str) -> Any:
-        return lambda *args: None
-
 
 def serve(channel: Connection, max_clients: int) -> None:
     """Run the server process; send its port, and at the end the times of the stops."""
-    backend: Any = StopRecorder()
+    backend = StopRecorder()
     access = AccessConfig(simulated=True)
     server = ConsoleServer(backend, ConsoleServerConfig(port=0, max_clients=max_clients, drive=PATIENT, access=access))
     server.start()

@@ -11,7 +11,7 @@ from instant_ic.bus import LATCHED, RELIABLE, SENSOR, Node, NodeError, main
 from instant_ic.bus.control import ControlError, NodeControl, NodeMissingError
 from instant_ic.bus.timers import Timer
 from instant_ic.bus.topics import Subscription
-from instant_ic.console import ConsoleError, ConsoleServer, FrameKind, Look
+from instant_ic.console import ConsoleBackend, ConsoleError, ConsoleServer, FrameKind, Look
 from instant_ic.console.config import ConsoleConfig
 from instant_ic.console.feed import PLAN_PERIOD_S, STATE_PERIOD_S, Inputs, PageFeed, PageServer
 from instant_ic.console.recording import RecorderError, RecordingDesk
@@ -22,7 +22,7 @@ from instant_ic.util.web_access import AccessError, offer_sign_in
 RECORDER_TIMEOUT_S = 3.0
 
 
-class ConsoleNode(Node[ConsoleConfig]):
+class ConsoleNode(Node[ConsoleConfig], ConsoleBackend):
     """The page's server on the topics: ``PageFeed`` feeds it, and the node handles the operator's actions."""
 
     name = "console"
@@ -55,7 +55,6 @@ class ConsoleNode(Node[ConsoleConfig]):
         except ConsoleError as error:
             raise NodeError(str(error)) from error
         self.recording = RecordingDesk(self.ask_recorder, lambda status: self.server.publish("recording", status))
-        self.on_record, self.on_snapshot = self.recording.record, self.recording.snapshot
         outputs = requests.publish, shown.publish
         self.feed = feed = PageFeed(
             config, self.page or self.server, self.tf, inputs, *outputs, self.clock, self.diagnose
@@ -70,9 +69,6 @@ class ConsoleNode(Node[ConsoleConfig]):
         self.subscribe("/heartbeat", msg.NodeStatus, feed.take_heartbeat, qos=RELIABLE)
         self.timer(1.0, feed.send_health)
         self.page_timers: list[Timer] = []
-        self.server.drive.on_released = self.release_lease
-        self.server.pages.on_renders = lambda: self.call_soon(self.feed_layers, True)
-        self.server.pages.on_watched = lambda watched: self.call_soon(self.feed_page, watched)
         self.feed_page(self.run_dir is None)  # in lockstep there are no pages that could come
         for warning in self.server.warnings:
             self.log.warning(warning)
@@ -131,8 +127,7 @@ class ConsoleNode(Node[ConsoleConfig]):
         # At once: a detour through the node's thread would add latency.
         self.command_out.publish(msg.twist_stamped(linear, angular, self.clock.now_ns(), self.server.drive.client))
 
-    def release_lease(self, client: str) -> None:
-        """Give the robot's lease back in the name of a page that drove."""
+    def on_released(self, client: str) -> None:
         self.command_out.publish(msg.twist_stamped(0.0, 0.0, self.clock.now_ns(), client + RELEASED))
 
     def on_operator(self, there: bool) -> None:
@@ -144,6 +139,21 @@ class ConsoleNode(Node[ConsoleConfig]):
 
     def on_look(self, look: Look) -> None:
         self.feed.requests.look = look
+
+    def on_watched(self, watched: bool) -> None:
+        self.call_soon(self.feed_page, watched)
+
+    def on_renders(self) -> None:
+        self.call_soon(self.feed_layers, True)
+
+    def on_drawn(self) -> None:
+        self.feed.report_shown()
+
+    def on_record(self, on: bool) -> None:
+        self.recording.record(on)
+
+    def on_snapshot(self) -> None:
+        self.recording.snapshot()
 
     def on_bookmark(self) -> None:
         name = f"bookmark {datetime.now():%H:%M:%S}"

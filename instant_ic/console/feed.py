@@ -66,8 +66,6 @@ class FeedClock(Protocol):
 class PageServer(Protocol):
     """Receiver of everything that the feed sends to pages; ``ConsoleServer`` is one."""
 
-    on_drawn: Callable[[], None]
-
     @property
     def plain_http(self) -> bool:
         """True if pages come over the network without encryption."""
@@ -128,7 +126,6 @@ class PageFeed:
     ) -> None:
         self.watched = True
         self.server = server
-        server.on_drawn = self.report_shown
         self._meshes = LayerMeshes()
         self._mount = config.camera_mount.xyz
         self.poses = RobotPoses(tf, inputs.control, inputs.vbot, config.camera_mount.xyz)

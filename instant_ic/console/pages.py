@@ -7,7 +7,6 @@ import contextlib
 import json
 import logging
 import time
-from collections.abc import Callable
 from typing import Any
 
 from aiohttp import WSCloseCode, WSMsgType, web
@@ -16,7 +15,7 @@ from instant_ic.console.access import Access
 from instant_ic.console.backend import ConsoleBackend
 from instant_ic.console.config import ConsoleServerConfig
 from instant_ic.console.connections import CLOSE_S, LimitedConnection
-from instant_ic.console.driving import DriveService
+from instant_ic.console.drive import DriveService
 from instant_ic.console.layers import PageLayers
 from instant_ic.console.protocol import FrameKind, PageProtocolError, flag, number, parse_text, whole
 from instant_ic.console.session import PageSession, PendingFrame
@@ -53,9 +52,6 @@ class Pages:
 
     Attributes:
         sessions: connected pages by number, oldest first.
-        on_watched: called when the first page comes (True) and when the last one has gone (False).
-        on_renders: called when a page says for the first time that it can render the virtual space.
-        on_drawn: called when :meth:`drawn_ms` has changed.
     """
 
     def __init__(
@@ -68,9 +64,6 @@ class Pages:
     ) -> None:
         self.page = page
         self.sessions: dict[int, PageSession] = {}
-        self.on_watched: Callable[[bool], None] = lambda watched: None
-        self.on_renders: Callable[[], None] = lambda: None
-        self.on_drawn: Callable[[], None] = lambda: None
         self._backend, self._config, self._drive, self._access = backend, config, drive, access
         drive.on_change = self._send_session
         self._next_number = 1
@@ -153,7 +146,7 @@ class Pages:
         self._next_number += 1
         self.sessions[session.number] = session  # before the first await, so that the place is taken
         if len(self.sessions) == 1:
-            self.on_watched(True)
+            self._backend.on_watched(True)
         sender: asyncio.Task[None] | None = None
         expiry: asyncio.TimerHandle | None = None
         try:
@@ -197,10 +190,11 @@ class Pages:
         """Remove a session: it loses the lease and receives nothing more."""
         if self.sessions.pop(session.number, None) is None:
             return
-        self._drive.forget(session.number)
+        self._drive.gate.forget(session.number, current().steady_s())
+        self._drive.settle()
         self._send_session()
         if not self.sessions:
-            self.on_watched(False)
+            self._backend.on_watched(False)
 
     def _end(self, session: PageSession, code: WSCloseCode, reason: str) -> None:
         """Drop a session at once, then close its socket whatever the client does."""
@@ -317,7 +311,8 @@ class Pages:
         if kind == "ping":
             session.away = flag(message, "away", False)
         # A hidden page keeps acknowledging images; that is no sign of an operator either.
-        self._drive.hear(session.number, now, session.away)
+        if self._drive.gate.touch(session.number, now, away=session.away):
+            self._drive.settle()
         handler(session, message, now)
 
     def _on_ping(self, session: PageSession, message: dict[str, Any], now: float) -> None:
@@ -343,12 +338,14 @@ class Pages:
     def _on_lease(self, session: PageSession, message: dict[str, Any], now: float) -> None:
         take = flag(message, "take", False)
         if _may_drive(session):
-            changed = self._drive.request(session.number, now, take)
-            self._send_session(None if changed else session)
+            self._drive.gate.request(session.number, now, take=take)
+            self._drive.settle()
+            self._send_session(session)
 
     def _on_yield(self, session: PageSession, message: dict[str, Any], now: float) -> None:
-        changed = self._drive.leave(session.number, now)
-        self._send_session(None if changed else session)
+        self._drive.gate.leave(session.number, now)
+        self._drive.settle()
+        self._send_session(session)
 
     def _on_estop(self, session: PageSession, message: dict[str, Any], now: float) -> None:
         self._drive.stop_robot(f"client {session.number}")
@@ -392,7 +389,7 @@ class Pages:
         before = self.drawn_ms()
         if not session.renders:
             session.renders = True
-            self.on_renders()
+            self._backend.on_renders()
         if version == 0:
             session.drawn = None
         else:
@@ -401,7 +398,7 @@ class Pages:
             shown_ms = state_ms if current_version else 0.0 if session.drawn is None else session.drawn[1]
             session.drawn = version, shown_ms
         if self.drawn_ms() != before:
-            self.on_drawn()
+            self._backend.on_drawn()
 
 
 def _refuse(session: PageSession, reason: str, text: str) -> None:

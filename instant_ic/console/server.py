@@ -2,7 +2,7 @@
 
 It does not depend on the bus. Data for the page comes through the methods of :class:`ConsoleServer`, which any thread
 may call. :class:`ConsoleServer` answers HTTP requests, :class:`~instant_ic.console.pages.Pages` serves the
-WebSockets, and :class:`~instant_ic.console.driving.DriveService` passes commands to the robot. The operator's actions
+WebSockets, and :class:`~instant_ic.console.drive.DriveService` passes commands to the robot. The operator's actions
 go to a :class:`~instant_ic.console.backend.ConsoleBackend`.
 """
 
@@ -26,7 +26,7 @@ from instant_ic.console.access import COOKIE, Access, AccessError, Role, tls_con
 from instant_ic.console.backend import ConsoleBackend
 from instant_ic.console.config import ConsoleServerConfig
 from instant_ic.console.connections import CLOSE_S, HEADERS_S, AddressBuckets, Listener, network_of
-from instant_ic.console.driving import DriveService
+from instant_ic.console.drive import DriveService
 from instant_ic.console.layers import PageLayers
 from instant_ic.console.log_rate import limit_logs
 from instant_ic.console.pages import Pages, now_ms
@@ -72,7 +72,6 @@ class ConsoleServer:
         access: sign-ins.
         drive: lease, commands and emergency stop.
         pages: WebSockets of the pages.
-        on_drawn: called when :meth:`drawn_ms` has changed.
         port: port on which the server listens; 0 before the start.
 
     Raises:
@@ -93,8 +92,6 @@ class ConsoleServer:
             raise ConsoleError(f"console: {error}") from error
         self.drive = DriveService(backend, self.config.drive)
         self.pages = Pages(backend, self.config, page or {}, self.drive, self.access)
-        self.pages.on_drawn = lambda: self.on_drawn()
-        self.on_drawn: Callable[[], None] = lambda: None
         self.port = 0
         self._requests = AddressBuckets(REQUESTS_PER_S, BURST_REQUESTS)
         self._sockets = AddressBuckets(SOCKETS_PER_S, BURST_SOCKETS)

@@ -133,7 +133,6 @@ class UnseenPage:
     """A connected page without a person in front of it; a :class:`~instant_ic.console.feed.PageServer`."""
 
     plain_http = False
-    on_drawn: Callable[[], None] = staticmethod(lambda: None)
 
     def now_ms(self) -> float:
         return 0.0

@@ -12,6 +12,7 @@ import demo_world
 import numpy as np
 from numpy.typing import NDArray
 
+from instant_ic.console.backend import ConsoleBackend
 from instant_ic.console.config import ConsoleServerConfig
 from instant_ic.console.gridimage import GridImage, grid_image
 from instant_ic.console.protocol import FrameKind
@@ -65,7 +66,7 @@ class DemoRecorder:
         }
 
 
-class Demo:
+class Demo(ConsoleBackend):
     """Backend with a simulated robot, and its server."""
 
     def __init__(
@@ -109,31 +110,22 @@ class Demo:
         ]
 
     def on_drive(self, linear: float, angular: float) -> None:
-        """See Backend."""
         self.commands.append((linear, angular))
         self._command = (linear, angular)
 
-    def on_operator(self, there: bool) -> None:
-        """See Backend."""
-
     def on_estop(self, stop: bool) -> None:
-        """See Backend."""
         self.estop = stop
 
     def on_look(self, look: Look) -> None:
-        """See Backend."""
         self.look = look
 
     def on_record(self, on: bool) -> None:
-        """See Backend."""
         self._desk.record(on)
 
     def on_snapshot(self) -> None:
-        """See Backend."""
         self._desk.snapshot()
 
     def on_bookmark(self) -> None:
-        """See Backend."""
         self._desk.bookmark("bookmark 12:00:00")
 
     def start(self) -> None:

@@ -3,6 +3,7 @@
 import asyncio
 import threading
 
+from instant_ic.console import ConsoleBackend
 from instant_ic.console.drive import DriveConfig
 
 WAIT_S = 60.0
@@ -19,11 +20,12 @@ class Patient(DriveConfig):
 PATIENT = Patient(watchdog_s=30.0, lease_timeout_s=60.0, max_command_age_s=10.0)
 
 
-class Backend:
+class Backend(ConsoleBackend):
     """Keeps what the operators do."""
 
     def __init__(self):
         self.commands, self.estops, self.looks, self.operator, self.recorder = [], [], [], [], []
+        self.released, self.watched = [], []
         self._news = threading.Condition()
 
     def on_drive(self, linear, angular):
@@ -37,6 +39,12 @@ class Backend:
 
     def on_look(self, look):
         self._add(self.looks, look)
+
+    def on_released(self, client):
+        self._add(self.released, client)
+
+    def on_watched(self, watched):
+        self._add(self.watched, watched)
 
     def on_record(self, on):
         self._add(self.recorder, ("record", on))

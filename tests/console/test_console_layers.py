@@ -169,7 +169,7 @@ def test_each_page_gets_a_version_once_and_only_what_it_lacks(server):
 def test_views_are_needed_unless_every_page_renders_the_newest_layers_by_itself(server, monkeypatch):
     server.send_layers(layers(5))
     news = []
-    server.on_drawn = lambda: news.append(server.drawn_ms())
+    server.backend.on_drawn = lambda: news.append(server.drawn_ms())
 
     async def scenario():
         async with ConsoleClient(server.url) as driver, ConsoleClient(server.url) as watcher:

@@ -179,7 +179,7 @@ def test_a_command_names_the_page_that_drives_and_its_lease_is_given_back(setup)
     bus, node, _ = setup
     node.on_drive(0.3, 0.0)
     assert bus.last("/operator/cmd_vel").header.frame_id == node.server.drive.client
-    node.release_lease("page 1")
+    node.on_released("page 1")
     assert bus.last("/operator/cmd_vel").header.frame_id == "page 1" + RELEASED
     assert twist_values(bus.last("/operator/cmd_vel")) == (0.0, 0.0)
 
@@ -371,7 +371,7 @@ def test_layers_are_taken_while_a_page_can_render_them(setup):
         return "/vspace/layers" in [subscription.raw.topic for subscription in node.subscriptions]
 
     assert not taken()
-    node.server.pages.on_renders()
+    node.on_renders()
     node.spin_once()
     assert taken()
     node.feed_page(False)

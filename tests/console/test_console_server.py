@@ -33,8 +33,7 @@ def in_thread(function, *args):
 
 def test_the_first_page_and_the_end_of_the_last_are_reported(serve):
     server = serve()
-    watched = []
-    server.pages.on_watched = watched.append
+    watched = server.backend.watched
 
     async def scenario():
         async with ConsoleClient(server.url):
@@ -197,8 +196,6 @@ def test_emergency_stop_from_a_watcher_is_latched_until_the_driver_releases_it(s
 
 def test_a_page_shows_who_drives_the_robot_and_not_who_has_this_servers_lease(serve):
     server = serve()
-    released = []
-    server.drive.on_released = released.append
 
     async def scenario():
         async with ConsoleClient(server.url) as client, ConsoleClient(server.url) as second:
@@ -218,7 +215,7 @@ def test_a_page_shows_who_drives_the_robot_and_not_who_has_this_servers_lease(se
             await client.wait_for(lambda c: (c.session["driver"], c.session["door"]) == ("you", ""), WAIT_S)
             await second.wait_for(lambda c: (c.session["driver"], c.session["door"]) == ("other", ""), WAIT_S)
             await second.send({"type": "lease", "take": True})
-            await until(lambda: released == [name])
+            await until(lambda: server.backend.released == [name])
             await client.wait_for(lambda c: c.session["driver"] == "other", WAIT_S)
             assert second.session["driver"] == "other"  # until the robot has granted it
             server.follow_robot(f"console/{server.drive.client}", False)

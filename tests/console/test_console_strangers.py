@@ -157,7 +157,7 @@ def test_fault_an_emergency_stop_waits_behind_other_clients_messages(serve):
         handle(session, message, now),
     )
     asked, loops = asyncio.Event(), []
-    server.pages.on_watched = lambda _: loops.append(asyncio.get_running_loop())
+    server.backend.on_watched = lambda _: loops.append(asyncio.get_running_loop())
 
     def stop(stopped):
         at_the_stop.append(handled.copy())
@@ -493,13 +493,10 @@ def test_connections_without_complete_headers_are_few_and_small(serve, monkeypat
 
 SERVER_WITHOUT_FILES = """
     import resource, sys
-    from types import SimpleNamespace
-    from instant_ic.console import ConsoleServer, ConsoleServerConfig
+    from instant_ic.console import ConsoleBackend, ConsoleServer, ConsoleServerConfig
     from instant_ic.console.access import AccessConfig
-    nothing = lambda *args: None
-    backend = SimpleNamespace(on_drive=nothing, on_operator=nothing, on_estop=nothing, on_look=nothing)
     many = dict(max_connections=1000, max_connections_per_address=1000)
-    server = ConsoleServer(backend, ConsoleServerConfig(port=0, access=AccessConfig(simulated=True), **many))
+    server = ConsoleServer(ConsoleBackend(), ConsoleServerConfig(port=0, access=AccessConfig(simulated=True), **many))
     server.start()
     resource.setrlimit(resource.RLIMIT_NOFILE, (40, 40))
     print(server.port, flush=True)

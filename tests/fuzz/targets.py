@@ -284,6 +284,7 @@ def _roboclaw_replies() -> Target:
 
 @target("console-messages", 2000)
 def _console_messages() -> Target:
+    from instant_ic.console.backend import ConsoleBackend
     from instant_ic.console.drive import DriveGate
     from instant_ic.console.protocol import PageProtocolError, parse_text
     from instant_ic.console.server import ConsoleServer
@@ -303,9 +304,7 @@ def _console_messages() -> Target:
         {"type": "bookmark"},
         {"type": "ack", "kind": 1, "seq": 5},
     )
-    names = ("drive", "operator", "estop", "look", "record", "snapshot", "bookmark")
-    backend: Any = SimpleNamespace(**{f"on_{name}": lambda *_: None for name in names})
-    server = ConsoleServer(backend)
+    server = ConsoleServer(ConsoleBackend())
 
     def parse(data: bytes) -> None:
         session = PageSession(1, None, None, None)  # type: ignore[arg-type]
