@@ -153,7 +153,7 @@ class Background:
         rgb[mask], opacity[mask] = colours, opacities
         return replace(self, rgb=rgb, opacity=opacity)
 
-    def draw(self, rays: Rays, wanted: NDArray[np.bool_], view: tuple[Floats, Floats, Floats]) -> Floats:
+    def render_rays(self, rays: Rays, wanted: NDArray[np.bool_], view: tuple[Floats, Floats, Floats]) -> Floats:
         """Render the background into a perspective view.
 
         Args:
@@ -164,21 +164,23 @@ class Background:
         Returns:
             Weight of the estimate in the view, 0 to 1, (P,); 0 where nothing was rendered.
         """
-        from instant_ic.vspace.background_kernels import draw_quads, paint
+        from instant_ic.vspace.background_kernels import colour_pixels, render_quads
 
         map_from_view, half = pinhole(rays)
         view_from_camera = (np.linalg.inv(map_from_view) @ self.map_from_camera).astype(np.float32)
         nearness, marks = np.zeros(rays.shape, np.float32), np.zeros(rays.shape, np.uint8)
         directions = rays_of(self.inverse_depth.shape)
         for mark, quads in ((1, self.quads), (2, self.sky_quads)):
-            draw_quads(quads, mark, self.inverse_depth, directions, view_from_camera, half, nearness, marks)
-        drawn = wanted & (nearness.reshape(-1) > 0)
+            render_quads(quads, mark, self.inverse_depth, directions, view_from_camera, half, nearness, marks)
+        rendered = wanted & (nearness.reshape(-1) > 0)
         colour, depth, confidence = view
-        depth[drawn] = 1 / (rays.axial[drawn] * nearness.reshape(-1)[drawn])
+        depth[rendered] = 1 / (rays.axial[rendered] * nearness.reshape(-1)[rendered])
         camera_from_map = np.linalg.inv(self.map_from_camera).astype(np.float32)
         share = np.zeros(len(depth), np.float32)
-        paint(self.rgb, self.opacity, camera_from_map, rays.origin, rays.directions, drawn, depth, colour, share)
-        confidence[drawn & (marks.reshape(-1) == 2)] = 1
+        colour_pixels(
+            self.rgb, self.opacity, camera_from_map, rays.origin, rays.directions, rendered, depth, colour, share
+        )
+        confidence[rendered & (marks.reshape(-1) == 2)] = 1
         return share
 
 

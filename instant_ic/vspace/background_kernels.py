@@ -9,7 +9,7 @@ from numba import njit
 
 from instant_ic.vspace.nerf.kernels import _OPTIONS
 from instant_ic.vspace.nerf.march import along, panorama_pixels
-from instant_ic.vspace.warp_kernels import NEAR_M, beyond, draw_triangle
+from instant_ic.vspace.warp_kernels import NEAR_M, beyond, rasterize_triangle
 
 SAME_THING = np.float32(2)
 """A surface nearer than an object's edge by more than this factor is not the object but what it stands on."""
@@ -64,7 +64,7 @@ def in_front(inverse, depth_edge, level, reach, steps):  # type: ignore[no-untyp
 
 
 @njit(**_OPTIONS)
-def draw_quads(  # type: ignore[no-untyped-def]
+def render_quads(  # type: ignore[no-untyped-def]
     quads, mark, inverse, directions, view_from_camera, half, nearness, marks
 ):
     """Render some quads of a panorama's mesh into a z-buffer.
@@ -72,7 +72,7 @@ def draw_quads(  # type: ignore[no-untyped-def]
     Args:
         quads: upper left pixels (row, column), (N, 2); mark: what ``marks`` gets.
         inverse: (h, w); directions: of the pixels, (h, w, 3).
-        view_from_camera, half, nearness, marks: as in ``warp_kernels.draw_mesh``.
+        view_from_camera, half, nearness, marks: as in ``warp_kernels.render_mesh``.
     """
     width = inverse.shape[1]
     aspect = np.float32(nearness.shape[0]) / np.float32(nearness.shape[1])
@@ -87,12 +87,12 @@ def draw_quads(  # type: ignore[no-untyped-def]
             tangled = tangled or x < NEAR_M
             common &= beyond(x, y, z, half, half * aspect)
         if common == 0:
-            draw_triangle(patch[0], patch[1], patch[2], tangled, mark, half, nearness, marks)
-            draw_triangle(patch[1], patch[3], patch[2], tangled, mark, half, nearness, marks)
+            rasterize_triangle(patch[0], patch[1], patch[2], tangled, mark, half, nearness, marks)
+            rasterize_triangle(patch[1], patch[3], patch[2], tangled, mark, half, nearness, marks)
 
 
 @njit(**_OPTIONS)
-def paint(  # type: ignore[no-untyped-def]
+def colour_pixels(  # type: ignore[no-untyped-def]
     rgb, shares, camera_from_map, origin, directions, wanted, depth, colour, share
 ):
     """Colours (P, 3) of a panorama (h, w, 3), bilinear, at places ``depth`` (P,) along rays where ``wanted`` (P,);

@@ -59,7 +59,7 @@ def trials(shown: KeyframeSet) -> tuple[WarpTrial, ...]:
         pose = newest.prior.map_from_camera.copy()
         pose[:3, 3] = older.prior.map_from_camera[:3, 3]
         rays = perspective_rays(pose, *_SIZE, _FOV)
-        colour, _, known = older.warp.draw(rays)
+        colour, _, known = older.warp.render_rays(rays)
         warped = compose(rays, newest, None)
         truth = np.clip(colour * exposure_gains([newest.prior, older.prior])[1], 0, 1).astype(np.float32)
         found.append(WarpTrial.of(rays, truth, (known > 0) & (warped.confidence > 0), warped.colour))

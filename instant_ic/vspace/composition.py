@@ -46,12 +46,12 @@ def compose(rays: Rays, keyframe: Keyframe | None, field: Rendering | None) -> C
     """
     if field is None:
         assert keyframe is not None, "neither a keyframe nor a field to render"
-        field = keyframe.warp.draw(rays)
+        field = keyframe.warp.render_rays(rays)
     colour, depth, confidence = field
     background = np.zeros(len(depth), np.float32)
     unseen = confidence == 0
     if keyframe is not None and unseen.any():
-        background = keyframe.background.draw(rays, unseen, field)
+        background = keyframe.background.render_rays(rays, unseen, field)
     return ComposedView(colour, depth, confidence, background)
 
 

@@ -125,9 +125,9 @@ class FallbackDevice:
         """Train one iteration, as ``Device.step``."""
         return self._call(lambda: self.backend.step(uniform, table_lr, network_lr))
 
-    def draw(self, rays: Rays, panorama_share: float, depth_share: float) -> tuple[Floats, Floats, Floats]:
-        """Render rays, as ``Device.draw``."""
-        return self._call(lambda: self.backend.draw(rays, panorama_share, depth_share))
+    def render_rays(self, rays: Rays, panorama_share: float, depth_share: float) -> tuple[Floats, Floats, Floats]:
+        """Render rays, as ``Device.render_rays``."""
+        return self._call(lambda: self.backend.render_rays(rays, panorama_share, depth_share))
 
     def _call(self, work: Callable[[], T]) -> T:
         try:
@@ -191,7 +191,7 @@ def check_device(make: Callable[[FieldConfig, TrainConfig], Device], field: Fiel
         found, expected = (device.step(uniform[number], 0.01, 0.01) for device in (ours, theirs))
         if not np.allclose(found, expected, rtol=AGREEMENT, atol=1e-4):
             raise DeviceError(f"step {number + 1} has the errors {found}, numba {expected}")
-    colours, depths, _ = zip(*(device.draw(rays, 0.5, 0.9) for device in (ours, theirs)), strict=True)
+    colours, depths, _ = zip(*(device.render_rays(rays, 0.5, 0.9) for device in (ours, theirs)), strict=True)
     alike = np.isclose(depths[0], depths[1], rtol=0.02) & np.all(np.abs(colours[0] - colours[1]) < 0.05, axis=1)
     if alike.mean() < 0.9:
         raise DeviceError(f"only {alike.mean():.0%} of an image's pixels are as numba renders them")

@@ -96,7 +96,7 @@ class MeshSpace(RayRenderer):
         width = min(_PROBE_WIDTH, rgb.shape[1])
         theirs: Floats = area_average(rgb, width // 2, width).astype(np.float32).reshape(-1, 3) / np.float32(255)
         rays = equirect_rays(pose, width)
-        colour, range_m, _ = self._draw(rays)
+        colour, range_m, _ = self._render_rays(rays)
         ours = colour / self._gain
         met = range_m > 0
         if self.config.mesh_fit_colours:
@@ -164,7 +164,7 @@ class MeshSpace(RayRenderer):
 
     def _view(self, rays: Rays, projection: str) -> View:
         height, width = rays.shape
-        colour, range_m, confidence = self._draw(rays)
+        colour, range_m, confidence = self._render_rays(rays)
         depth, confidence = range_m.reshape(height, width), confidence.reshape(height, width)
         image = continue_unseen(colour.reshape(height, width, 3), depth, confidence, wraps=projection == "equirect")
         rgb = np.rint(np.clip(image, 0, 1) * np.float32(255)).astype(np.uint8)
@@ -172,7 +172,7 @@ class MeshSpace(RayRenderer):
         mse = (1 - unseen) * self._mse + UNSEEN_GAIN * unseen * self._variance
         return View(rgb, depth, confidence, projection, psnr_of_mse(mse))
 
-    def _draw(self, rays: Rays) -> tuple[Floats, Floats, Floats]:
+    def _render_rays(self, rays: Rays) -> tuple[Floats, Floats, Floats]:
         """Colours (P, 3) in 0..1, range (P,) with 0 where nothing is met, and confidence (P,)."""
         height, width = rays.shape
         turn = self._map_from_mesh[:3, :3].astype(np.float32)

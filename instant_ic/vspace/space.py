@@ -311,7 +311,7 @@ class VirtualSpace(RayRenderer):
 
     def _choose(self) -> None:
         """Show the field or the warp, whichever renders the older keyframes better."""
-        renderings = [self.device.draw(trial.rays, 0.0, LEAST_DEPTH_SHARE) for trial in self.trials]
+        renderings = [self.device.render_rays(trial.rays, 0.0, LEAST_DEPTH_SHARE) for trial in self.trials]
         left = self.config.train.iterations - self._run.schedule.iteration
         self.choice.take(gain_db(self.trials, renderings), left / self.config.readiness.plateau_iterations)
 
@@ -384,7 +384,7 @@ class VirtualSpace(RayRenderer):
         """Render a keyframe: its panorama warped, or the field; a panorama ``around`` is not warped."""
         share, field = self._panorama_share, None
         if share == 0 or around:
-            field = self.device.draw(rays, share, max(share, LEAST_DEPTH_SHARE))
+            field = self.device.render_rays(rays, share, max(share, LEAST_DEPTH_SHARE))
         return compose(rays, None if around else shown.newest, field)
 
     @property

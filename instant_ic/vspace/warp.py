@@ -83,7 +83,7 @@ class PanoramaWarp:
     """A panorama with depth that can be seen from elsewhere.
 
     Attributes:
-        inverse, depth_edge, known: arrays of its mesh, as ``warp_kernels.draw_mesh`` takes them, (h + 2, w).
+        inverse, depth_edge, known: arrays of its mesh, as ``warp_kernels.render_mesh`` takes them, (h + 2, w).
 
     Example:
         >>> warp = PanoramaWarp(prepare(rgb, depth_m, map_from_camera, 0.0, GeometryConfig(), 4096))  # doctest: +SKIP
@@ -133,15 +133,15 @@ class PanoramaWarp:
         """
         check_size(width, height)
         rays = perspective_rays(checked_pose(map_from_camera), width, height, fov_rad)
-        colour, depth, confidence = self.draw(rays)
+        colour, depth, confidence = self.render_rays(rays)
         depth, confidence = depth.reshape(height, width), confidence.reshape(height, width)
         image = continue_unseen(colour.reshape(height, width, 3), depth, confidence)
         rgb = np.rint(np.clip(image, 0, 1) * np.float32(255)).astype(np.uint8)
         return View(rgb, depth, confidence)
 
-    def draw(self, rays: Rays) -> tuple[Floats, Floats, Floats]:
+    def render_rays(self, rays: Rays) -> tuple[Floats, Floats, Floats]:
         """Colours (P, 3) in 0..1, depth along the ray (P,) and confidence (P,) of a perspective view's rays, as
-        ``field.Device.draw``; what has no confidence has no colour, unless nothing has any.
+        ``field.Device.render_rays``; what has no confidence has no colour, unless nothing has any.
         """
         from instant_ic.vspace import warp_kernels
 
@@ -153,7 +153,7 @@ class PanoramaWarp:
         warp_kernels.place_vertices(
             self.inverse, self._directions, view_from_camera, half, aspect, self._vertices, self._outside
         )
-        warp_kernels.draw_mesh(
+        warp_kernels.render_mesh(
             self._vertices, self._outside, self.inverse, self.depth_edge, self.known, self._halves,
             view_from_camera, half, nearness, marks,
         )  # fmt: skip

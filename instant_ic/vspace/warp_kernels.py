@@ -51,7 +51,7 @@ def place_vertices(inverse, directions, view_from_camera, half, aspect, vertices
 
 
 @njit(**_OPTIONS)
-def draw_triangle(a, b, c, clipped, mark, half, nearness, marks):  # type: ignore[no-untyped-def]
+def rasterize_triangle(a, b, c, clipped, mark, half, nearness, marks):  # type: ignore[no-untyped-def]
     """One triangle into the z-buffer; corners are (x, y, z) in the view's frame, x forward.
 
     Edge functions are taken in homogeneous coordinates (Olano and Greer, 1997), so that nothing need be clipped:
@@ -92,7 +92,7 @@ def draw_triangle(a, b, c, clipped, mark, half, nearness, marks):  # type: ignor
 
 
 @njit(**_OPTIONS)
-def draw_mesh(  # type: ignore[no-untyped-def]
+def render_mesh(  # type: ignore[no-untyped-def]
     vertices, outside, inverse, depth_edge, known, corners, view_from_camera, half, nearness, marks
 ):
     """Render the panorama's mesh into a z-buffer.
@@ -122,8 +122,8 @@ def draw_mesh(  # type: ignore[no-untyped-def]
                 a, b, c, d = vertices[v, u], vertices[v, right], vertices[v + 1, u], vertices[v + 1, right]
                 seen = known[v, u] and known[v, right] and known[v + 1, u] and known[v + 1, right]
                 mark = KNOWN if seen else FILLED
-                draw_triangle(a, b, c, codes & 1, mark, half, nearness, marks)
-                draw_triangle(b, d, c, codes & 1, mark, half, nearness, marks)
+                rasterize_triangle(a, b, c, codes & 1, mark, half, nearness, marks)
+                rasterize_triangle(b, d, c, codes & 1, mark, half, nearness, marks)
                 continue
             for corner in range(4):
                 row, column = v + corner // 2, right if corner % 2 else u
@@ -148,8 +148,8 @@ def draw_mesh(  # type: ignore[no-untyped-def]
                 if common:
                     continue
                 mark = KNOWN if known[row, column] else FILLED
-                draw_triangle(patch[0], patch[1], patch[2], tangled, mark, half, nearness, marks)
-                draw_triangle(patch[1], patch[3], patch[2], tangled, mark, half, nearness, marks)
+                rasterize_triangle(patch[0], patch[1], patch[2], tangled, mark, half, nearness, marks)
+                rasterize_triangle(patch[1], patch[3], patch[2], tangled, mark, half, nearness, marks)
 
 
 @njit(**_OPTIONS)

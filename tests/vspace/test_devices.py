@@ -111,8 +111,8 @@ def test_a_gpu_without_memory_is_no_fault_of_the_kernels(gpu):
 
 def test_the_check_compares_views_too():
     class WrongColours(Broken):
-        def draw(self, *arguments):
-            colour, depth, confidence = super().draw(*arguments)
+        def render_rays(self, *arguments):
+            colour, depth, confidence = super().render_rays(*arguments)
             return 1 - colour, depth, confidence
 
     check_device(Broken, CONFIG.field)

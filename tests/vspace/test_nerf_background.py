@@ -95,18 +95,18 @@ def test_floor_and_ceiling_are_found_and_go_on_behind_a_thing():
 def test_the_guess_lies_fixed_in_the_map():
     """Two places in the map that nobody has seen have one colour in pictures from different poses."""
     background = Background.of(keyframe())
-    drawn = []
+    rendered = []
     for pose in (pose_matrix(y=0.6, yaw=-0.2), pose_matrix(x=0.2, y=0.9, yaw=-0.3)):
         rays = perspective_rays(pose, 96, 64, 1.2)
         picture = np.zeros((96 * 64, 3), np.float32), np.zeros(96 * 64, np.float32), np.zeros(96 * 64, np.float32)
-        done = background.draw(rays, np.ones(96 * 64, bool), picture)
+        done = background.render_rays(rays, np.ones(96 * 64, bool), picture)
         ends = rays.origin + picture[1][:, None] * rays.directions
         azimuth = np.arctan2(ends[:, 1], ends[:, 0])
         inside = (done > 0) & (np.abs(azimuth) < 0.2) & (np.abs(ends[:, 2]) < 0.5)
         assert inside.sum() > 50
         assert np.linalg.norm(ends[inside], axis=1) == pytest.approx(np.full(inside.sum(), 4.0), rel=0.01)
-        drawn.append(picture[0][inside].mean(axis=0))
-    assert drawn[0] == pytest.approx(drawn[1], abs=0.01)
+        rendered.append(picture[0][inside].mean(axis=0))
+    assert rendered[0] == pytest.approx(rendered[1], abs=0.01)
 
 
 def hall(door=False):

@@ -30,12 +30,12 @@ def test_the_gain_by_hand():
     assert trial.warp_error[:2] == pytest.approx(0.04) and math.isnan(trial.warp_error[2])
     colour = flat(0.5)
     colour[0], colour[2:] = 0.6, 0.0  # errors 0.01 and 0 where both count: 0.08 against 0.01 in sum
-    drawing = colour, np.ones(4, np.float32), np.array([1, 1, 1, 0], np.float32)
-    assert gain_db([trial], [drawing]) == pytest.approx(10 * math.log10(8), abs=1e-3)
+    rendering = colour, np.ones(4, np.float32), np.array([1, 1, 1, 0], np.float32)
+    assert gain_db([trial], [rendering]) == pytest.approx(10 * math.log10(8), abs=1e-3)
     # A second image where the field is off by 0.3: 0.08 + 4 · 0.01 against 0.01 + 4 · 0.09.
     other = WarpTrial.of(None, flat(0.5), np.ones(4, bool), flat(0.6))
     off = flat(0.8), np.ones(4, np.float32), np.ones(4, np.float32)
-    assert gain_db([trial, other], [drawing, off]) == pytest.approx(10 * math.log10(0.12 / 0.37), abs=1e-3)
+    assert gain_db([trial, other], [rendering, off]) == pytest.approx(10 * math.log10(0.12 / 0.37), abs=1e-3)
     assert math.isnan(gain_db([], []))
 
 
@@ -93,16 +93,19 @@ def test_a_field_that_loses_is_not_shown_and_stops():
 
 def test_a_field_that_wins_is_shown_until_it_loses(monkeypatch):
     space = driven(3)
-    true, colours = space.device.backend.draw, {trial.rays.origin.tobytes(): trial.truth for trial in space.trials}
+    true, colours = (
+        space.device.backend.render_rays,
+        {trial.rays.origin.tobytes(): trial.truth for trial in space.trials},
+    )
     before = space.render(space.keyframe.map_from_camera, 48, 27, 1.5).rgb
 
-    def draw(rays, panorama_share, depth_share):
+    def render_rays(rays, panorama_share, depth_share):
         """The truth with an error of 1 % of full scale; a view elsewhere is white."""
         truth = colours.get(rays.origin.tobytes(), np.ones(rays.directions.shape, np.float32))
         return truth + np.float32(0.01), *true(rays, panorama_share, depth_share)[1:]
 
     with monkeypatch.context() as patch:
-        patch.setattr(space.device.backend, "draw", draw)
+        patch.setattr(space.device.backend, "render_rays", render_rays)
         space.train(iterations=10)
         assert space.status.shows_field and space.status.gain_db > 3
         assert space.render(space.keyframe.map_from_camera, 48, 27, 1.5).rgb.mean() > 240

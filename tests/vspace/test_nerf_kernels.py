@@ -255,9 +255,9 @@ def test_rendering_agrees_with_the_reference(name, share, depth_share, request):
     torch_device.load(device.parameters())
     torch_device.set_scene(scene)
     rays = perspective_rays(pose_matrix(0.6, -0.5, 0, yaw=0.2), 48, 32, 1.5)
-    expected_colour, expected_depth, expected_confidence = torch_device.draw(rays, share, depth_share)
+    expected_colour, expected_depth, expected_confidence = torch_device.render_rays(rays, share, depth_share)
     device.first_stride = 1
-    colour, depth, confidence = device.draw(rays, share, depth_share)
+    colour, depth, confidence = device.render_rays(rays, share, depth_share)
     same = np.isclose(depth, expected_depth, rtol=0.005)
     assert same.mean() > 0.98  # a rounding decides at cell borders and edges
     assert np.mean(expected_depth > 0) > 0.8
@@ -265,7 +265,7 @@ def test_rendering_agrees_with_the_reference(name, share, depth_share, request):
     assert np.quantile(np.abs(colour[same] - expected_colour[same]), 0.99) < 0.02
     # Interpolating between every fourth pixel's depth changes little where both meet a surface.
     device.first_stride = 4
-    _, depth, _ = device.draw(rays, share, depth_share)
+    _, depth, _ = device.render_rays(rays, share, depth_share)
     both = (depth > 0) & (expected_depth > 0)
     relative = np.abs(depth[both] / expected_depth[both] - 1)
     assert np.median(relative) < 0.003
@@ -304,11 +304,11 @@ def test_the_march_by_hand():
         # Behind the surface everywhere: met at the first place in the band. In front everywhere, so that there is no
         # crossing: the place in the band that came nearest. Never outside of the band
         # (but for the interpolation between traced pixels, which takes the sphere for flat).
-        colour, depth, _ = device.draw(rays, 0.0, 0.0)
+        colour, depth, _ = device.render_rays(rays, 0.0, 0.0)
         assert depth.min() > 1.88
         assert depth.max() < 2.12
         assert colour == pytest.approx(np.tile([0.6, 0.7, 0.8], (512, 1)), abs=1e-5)
     scene.occupancy.distance[...] = 30  # nothing anywhere
-    _, depth, confidence = device.draw(rays, 1.0, 0.0)
+    _, depth, confidence = device.render_rays(rays, 1.0, 0.0)
     assert not depth.any()
     assert not confidence.any()

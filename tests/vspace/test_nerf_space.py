@@ -198,7 +198,7 @@ def once(call):
     return limited
 
 
-@pytest.mark.parametrize("call", ["step", "draw", "set_scene"])
+@pytest.mark.parametrize("call", ["step", "render_rays", "set_scene"])
 def test_a_gpu_without_memory_is_left_for_the_cpu_with_what_is_learnt(call, monkeypatch):
     monkeypatch.setattr("instant_ic.vspace.devices._may_have_cuda", lambda: False)
     # Pictures by the field.

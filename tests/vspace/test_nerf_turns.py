@@ -11,7 +11,7 @@ def run(render_ms, asks_fps, render_fps=10.0, train_ms=50.0, seconds=20.0, train
     Returns:
         Pictures a second, training's share of the time, and the longest that a picture asked for had to wait, ms.
     """
-    turns, now, drawn, trained, waited = Turns(render_fps, train_ms), 0.0, 0, 0.0, 0.0
+    turns, now, rendered, trained, waited = Turns(render_fps, train_ms), 0.0, 0, 0.0, 0.0
     next_ask, asked_at = (0.0 if asks_fps else float("inf")), None
     while now < seconds * 1e3:
         if now >= next_ask:
@@ -20,7 +20,7 @@ def run(render_ms, asks_fps, render_fps=10.0, train_ms=50.0, seconds=20.0, train
         if asked_at is not None and turns.renders_next(trains):
             waited, asked_at = max(waited, now - asked_at), None
             now += render_ms
-            drawn += 1
+            rendered += 1
             turns.rendered(render_ms)
         elif trains:
             budget, start = turns.budget_ms(), now
@@ -29,7 +29,7 @@ def run(render_ms, asks_fps, render_fps=10.0, train_ms=50.0, seconds=20.0, train
             trained += now - start
         else:
             now = next_ask if asked_at is None else now
-    return drawn / seconds, trained / (seconds * 1e3), waited
+    return rendered / seconds, trained / (seconds * 1e3), waited
 
 
 def test_the_rate_that_is_asked_for_is_held_and_training_has_the_rest():

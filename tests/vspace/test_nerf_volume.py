@@ -127,7 +127,7 @@ def test_training_and_pictures_agree_with_the_reference(scene):
     devices[0].first_stride = 1
     rays = perspective_rays(pose_matrix(0.6, -0.5, 0, yaw=0.2), 48, 32, 1.5)
     for shares in ((0.0, 0.0), (0.5, 0.5)):
-        ours, theirs = (device.draw(rays, *shares) for device in devices)
+        ours, theirs = (device.render_rays(rays, *shares) for device in devices)
         same = np.isclose(ours[1], theirs[1], rtol=0.005)
         assert same.mean() > 0.97
         assert np.mean(ours[1] > 0) > 0.8
@@ -148,13 +148,15 @@ def test_a_dense_wall_is_drawn_where_it_stands():
         device.first_stride = 1
         device.load(p)
         device.set_scene(scene)
-        colour, depth, confidence = device.draw(rays, 0.0, 0.0)
+        colour, depth, confidence = device.render_rays(rays, 0.0, 0.0)
         assert np.median(depth) == pytest.approx(expected, abs=0.004)
         # What of the light is not stopped comes from a mid-grey ground: 2 bands at e^raw a band.
         stopped = 1 - math.exp(-2 * math.exp(raw))
         assert colour == pytest.approx(np.tile(0.5 + stopped * np.array([0.1, 0.2, 0.3]), (512, 1)), abs=2e-3)
         assert confidence.min() == 1
-        assert np.median(device.draw(rays, 0.0, 1.0)[1]) == pytest.approx(2.0, abs=0.004)  # the guiding depth alone
+        assert np.median(device.render_rays(rays, 0.0, 1.0)[1]) == pytest.approx(
+            2.0, abs=0.004
+        )  # the guiding depth alone
 
 
 def test_a_field_of_density_needs_tiles_of_rays():

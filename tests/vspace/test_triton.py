@@ -222,8 +222,8 @@ def test_rendering_agrees_with_the_reference(scene):
     device.load(torch_device.parameters())
     device.set_scene(scene)
     rays = perspective_rays(pose_matrix(0.6, -0.5, 0, yaw=0.2), 9, 6, 1.5)  # no whole tiles
-    colour, depth, confidence = device.draw(rays, 0.6, 0.5)
-    expected_colour, expected_depth, expected_confidence = torch_device.draw(rays, 0.6, 0.5)
+    colour, depth, confidence = device.render_rays(rays, 0.6, 0.5)
+    expected_colour, expected_depth, expected_confidence = torch_device.render_rays(rays, 0.6, 0.5)
     assert colour.shape == (9 * 6, 3)
     assert np.mean(expected_depth > 0) > 0.8
     same = np.isclose(depth, expected_depth, rtol=0.01)
@@ -248,6 +248,6 @@ def test_all_kernels_compile_for_gpus_that_are_not_here(tmp_path):
     )  # fmt: skip
     assert made.returncode == 0, made.stderr[-2000:]
     lowered = [line for line in made.stdout.splitlines() if line.startswith("ttgir")]
-    assert lowered == ["ttgir gradient 80 8", "ttgir gradient 90 1", "ttgir gradient 90 16", "ttgir draw 90"]
+    assert lowered == ["ttgir gradient 80 8", "ttgir gradient 90 1", "ttgir gradient 90 16", "ttgir render_rays 90"]
     whole = [line.split()[1] for line in made.stdout.splitlines() if line.startswith("cubin")]
     assert whole == ["sample_rays", "gradient", "adam_table", "adam_network"]

@@ -117,10 +117,10 @@ class TorchDevice:
         return float((losses[0] / share[0]).detach()), float((losses[1] / share[1]).detach())
 
     @torch.no_grad()
-    def draw(self, rays: Rays, panorama_share: float, depth_share: float) -> tuple[Floats, Floats, Floats]:
+    def render_rays(self, rays: Rays, panorama_share: float, depth_share: float) -> tuple[Floats, Floats, Floats]:
         origin, directions = torch.from_numpy(rays.origin).to(self._device), self._directions(rays)
-        draw = self._draw_density if self._density else self._draw_distance
-        parts = [draw(origin, part, panorama_share, depth_share) for part in directions.split(RAYS_AT_ONCE)]
+        render = self._render_density if self._density else self._render_distance
+        parts = [render(origin, part, panorama_share, depth_share) for part in directions.split(RAYS_AT_ONCE)]
         colour, depth, confidence = (torch.cat(tensors).cpu().numpy() for tensors in zip(*parts, strict=True))
         return colour, depth, confidence
 
@@ -132,7 +132,7 @@ class TorchDevice:
             self._newest_lens = rays.lens, torch.from_numpy(rays.lens).to(self._device)
         return self._newest_lens[1] @ torch.from_numpy(rays.turn).to(self._device).T
 
-    def _draw_distance(
+    def _render_distance(
         self, origin: Tensor, directions: Tensor, panorama_share: float, depth_share: float
     ) -> tuple[Tensor, Tensor, Tensor]:
         depth, confidence = reference.trace(self._field, self._grid, self._priors, depth_share, origin, directions)
@@ -143,7 +143,7 @@ class TorchDevice:
         reference.mix_panorama(self._priors, origin, directions, depth, confidence, panorama_share, colour)
         return colour, depth, confidence
 
-    def _draw_density(
+    def _render_density(
         self, origin: Tensor, directions: Tensor, panorama_share: float, depth_share: float
     ) -> tuple[Tensor, Tensor, Tensor]:
         guide, confidence = reference.trace(self._field, self._grid, self._priors, 1.0, origin, directions)

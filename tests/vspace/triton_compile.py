@@ -75,8 +75,8 @@ def main(capabilities):
     for field, target in fields:
         lower(source_of(triton_kernels.gradient, {**kernel_shape(field), "B": TRAIN_BLOCK}), target)
         sys.stdout.write(f"ttgir gradient {target.arch} {field.levels}\n")
-    lower(source_of(triton_kernels.draw, {**FIELD, "B": TILE}), targets[-1])  # 20 s to the end
-    sys.stdout.write(f"ttgir draw {targets[-1].arch}\n")
+    lower(source_of(triton_kernels.render_rays, {**FIELD, "B": TILE}), targets[-1])  # 20 s to the end
+    sys.stdout.write(f"ttgir render_rays {targets[-1].arch}\n")
     for kernel, constants in WHOLE:
         made = triton.compile(source_of(kernel, constants), target=targets[-1], options={"num_warps": 4})
         sys.stdout.write(f"cubin {kernel.fn.__name__} {len(made.asm['cubin'])}\n")

@@ -256,7 +256,7 @@ class Device(Protocol):
             Mean squared colour error (0..1 units) and mean squared distance error (units of the band).
         """
 
-    def draw(self, rays: Rays, panorama_share: float, depth_share: float) -> tuple[Floats, Floats, Floats]:
+    def render_rays(self, rays: Rays, panorama_share: float, depth_share: float) -> tuple[Floats, Floats, Floats]:
         """Colours (P, 3) in 0..1, depth along the ray (P,) with 0 where nothing is met, confidence (P,).
 
         Args:

@@ -120,7 +120,7 @@ class NumbaDevice:
             value -= step_size * m / (np.sqrt(v) + betas[2])
             grad[...] = 0
 
-    def draw(self, rays: Rays, panorama_share: float, depth_share: float) -> tuple[Floats, Floats, Floats]:
+    def render_rays(self, rays: Rays, panorama_share: float, depth_share: float) -> tuple[Floats, Floats, Floats]:
         # A density is composited round the keyframes' own depth.
         axial_depth, confidence = self._trace(rays, 1.0 if self._density else depth_share)
         depth = axial_depth / rays.axial

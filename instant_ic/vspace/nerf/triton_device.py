@@ -188,7 +188,7 @@ class TritonDevice:
             b.table_grad, b.network_grad, b.sums, **self._shape, B=TRAIN_BLOCK,
         )  # fmt: skip
 
-    def draw(self, rays: Rays, panorama_share: float, depth_share: float) -> tuple[Floats, Floats, Floats]:
+    def render_rays(self, rays: Rays, panorama_share: float, depth_share: float) -> tuple[Floats, Floats, Floats]:
         assert self._scene is not None, "set_scene first"
         p, scene = self._p, self._scene
         q = scene.priors
@@ -202,7 +202,7 @@ class TritonDevice:
         colour, depth, confidence = out[: 3 * room], out[3 * room : 4 * room], out[4 * room :]
         height, width = q["rgb"].shape[1:3]
         h, w = q["inverse_depth"].shape[1:]
-        kernels.draw[(math.ceil(rows / 8) * math.ceil(columns / 8),)](
+        kernels.render_rays[(math.ceil(rows / 8) * math.ceil(columns / 8),)](
             p.table, size, p.network, scene.cells_per_m, scene.origin, scene.focus, scene.grid, scene.low,
             q["rgb"], q["inverse_depth"], q["depth_edge"], q["known"], q["camera_from_map"], scene.camera, q["band"],
             q["gains"], scene.keyframes, view, view[3:], directions, columns, rows, width, height, w, h,

@@ -498,7 +498,7 @@ def _march(
 
 
 @triton.jit(do_not_specialize=["size", "keyframes", "columns", "rows", "width", "height", "w", "h", "nx", "ny", "nz"])
-def draw(
+def render_rays(
     table, size, network, cells_per_m, origin, focus, grid, grid_low, rgb, inverse, depth_edge, known, poses, camera,
     band, gain, keyframes, eye, turn, directions, columns, rows, width, height, w, h, nx, ny, nz, cell,
     panorama_share, depth_share, colour, depth, confidence,

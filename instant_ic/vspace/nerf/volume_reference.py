@@ -71,6 +71,6 @@ def composite(
     opacity = w.sum(dim=1) + 1e-6
     colour = torch.zeros_like(directions)
     colour[met] = ((w[..., None] * output[..., :3]).sum(dim=1) + 0.5).clamp(0, 1)
-    drawn = depth.clone()
-    drawn[met] *= 1 + (1 - depth_share) * share * (w * offset).sum(dim=1) / opacity
-    return colour, drawn
+    rendered = depth.clone()
+    rendered[met] *= 1 + (1 - depth_share) * share * (w * offset).sum(dim=1) / opacity
+    return colour, rendered
