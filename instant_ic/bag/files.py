@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import heapq
-import json
 from collections import Counter
 from collections.abc import Callable, Collection, Generator, Iterator
 from contextlib import closing
@@ -15,9 +14,9 @@ from rosbags.interfaces import Connection
 from rosbags.rosbag2 import Reader, ReaderError
 
 from instant_ic.bag.bounded import guard_rosbags
-from instant_ic.bag.mcap_writer import Schema
-from instant_ic.bag.message import BagError, BagMessage
-from instant_ic.bag.metadata import REPEATED, preset_of, schema_of, schema_or_unknown, store_of
+from instant_ic.bag.latched import Repetitions
+from instant_ic.bag.message import BagError, BagMessage, Schema
+from instant_ic.bag.metadata import preset_of, schema_of, schema_or_unknown, store_of
 from instant_ic.bag.upgrade import upgrade_of
 from instant_ic.bus.qos import QoS
 from instant_ic.msg import deserialize
@@ -50,7 +49,7 @@ class PartSummary:
 class BagReader(Closing):
     """Reads a bag; a context manager.
 
-    Latched values that a recorder repeats at the start of each file are counted once and returned once.
+    Latched values that a recorder repeats at the start of each file are returned once.
 
     Args:
         path: rosbag2 folder, ``.mcap`` or ``.db3`` file.
@@ -83,16 +82,6 @@ class BagReader(Closing):
             if not (isinstance(connection.topic, str) and isinstance(connection.msgtype, str)):
                 self._reader.close()
                 raise BagError(f"bag {path} is damaged: topic {connection.topic!r} has the type {connection.msgtype!r}")
-        self._repeated: dict[str, Counter[str]] = {}
-        self._repeated_ns: dict[str, int] = {}
-        try:
-            for file, entry in json.loads(self.custom.get(REPEATED, "{}")).items():
-                self._repeated[file], self._repeated_ns[file] = Counter(entry["topics"]), int(entry["stamp_ns"])
-        except (ValueError, LookupError, TypeError, AttributeError) as error:
-            self._reader.close()
-            raise BagError(
-                f"bag {path}: {REPEATED} in metadata.yaml is wrong ({error}): ic bag recover {path}"
-            ) from None
 
     def close(self) -> None:
         if self._reader.is_open:
@@ -110,7 +99,8 @@ class BagReader(Closing):
 
     @property
     def count(self) -> int:
-        return int(self._reader.message_count) - sum(topics.total() for topics in self._repeated.values())
+        """Messages, with the latched values that the files of a recorder repeat."""
+        return int(self._reader.message_count)
 
     @property
     def custom(self) -> dict[str, str]:
@@ -133,12 +123,7 @@ class BagReader(Closing):
                     f"{self.path}: metadata.yaml: message_count of {connection.topic} is {connection.msgcount!r}, "
                     "not a whole number; ic bag recover makes a new bag"
                 ) from None
-        for topics in self._repeated.values():
-            for key in counts:
-                counts[key] -= topics[key[0]]
-        return [
-            TopicSummary(*key, max(0, counts[key]), _qos(first[key]), schema_of(first[key])) for key in sorted(counts)
-        ]
+        return [TopicSummary(*key, counts[key], _qos(first[key]), schema_of(first[key])) for key in sorted(counts)]
 
     @property
     def files(self) -> list[Path]:
@@ -155,9 +140,8 @@ class BagReader(Closing):
         found = []
         for storage in self._storages:
             meta, path = storage.metadata, Path(storage.path)
-            count = int(meta.message_count) - self._repeated.get(path.name, Counter()).total()
             span = (int(meta.start_time), int(meta.end_time) - 1) if meta.message_count else (0, 0)
-            found.append(PartSummary(path, *span, count))
+            found.append(PartSummary(path, *span, int(meta.message_count)))
         return found
 
     @property
@@ -201,12 +185,15 @@ class BagReader(Closing):
                     f"bag {self.path}, topic {connection.topic}: its messages are {encoding!r}, not CDR. Choose other "
                     f"topics, or copy those in CDR: ic bag recover {self.path}"
                 )
+        repetitions = Repetitions(part.start_ns for part in self.parts[1:] if part.count)
         presets = {(c.topic, c.msgtype): _qos(c) for c in connections}
         try:
             with closing(self._raw(connections, start_ns, stop_ns)) as raw:
                 for connection, stamp_ns, payload in raw:
                     qos = presets[connection.topic, connection.msgtype]
-                    yield BagMessage(connection.topic, connection.msgtype, payload, stamp_ns, qos)
+                    message = BagMessage(connection.topic, connection.msgtype, payload, stamp_ns, qos)
+                    if not repetitions.repeats(message):
+                        yield message
         except Exception as error:  # noqa: BLE001 - a parser or decompressor may raise anything on damaged bytes
             raise BagError(f"bag {self.path} is damaged: {error}; try ic bag recover {self.path}") from None
 
@@ -270,24 +257,10 @@ class BagReader(Closing):
             yield from self._reader.messages(connections, start_ns, stop_ns)
             return
         # Merge by stamp: files are not in stamp order where a clock was set back or files overlap.
-        streams = [self._of_part(storage, connections, start_ns, stop_ns) for storage in self._storages]
-        yield from streams[0] if len(streams) == 1 else heapq.merge(*streams, key=lambda entry: entry[1])
-
-    def _of_part(
-        self, storage: Any, connections: list[Connection], start_ns: int | None, stop_ns: int | None
-    ) -> Iterator[tuple[Connection, int, bytes]]:
         wanted = {(c.topic, c.msgtype) for c in connections}
-        chosen = [c for c in storage.connections if (c.topic, c.msgtype) in wanted]
-        if not chosen:
-            return
-        name = Path(storage.path).name
-        repeated, repeated_ns = Counter(self._repeated.get(name, {})), self._repeated_ns.get(name)
-        # Repeated values come first in their file, before other messages with the same stamp.
-        for connection, stamp_ns, payload in storage.messages(chosen, start_ns, stop_ns):
-            if stamp_ns == repeated_ns and repeated[connection.topic] > 0:
-                repeated[connection.topic] -= 1
-                continue
-            yield connection, stamp_ns, payload
+        chosen = [(s, [c for c in s.connections if (c.topic, c.msgtype) in wanted]) for s in self._storages]
+        streams = [storage.messages(its, start_ns, stop_ns) for storage, its in chosen if its]
+        yield from heapq.merge(*streams, key=lambda entry: entry[1])
 
     def _why_no_metadata(self) -> str:
         if any(self.path.glob("*.mcap")):

@@ -1,6 +1,8 @@
-"""The current value of each latched topic, so that every file of a bag can start with it."""
+"""The current value of each latched topic, with which every file of a bag starts."""
 
 from __future__ import annotations
+
+from collections.abc import Iterable
 
 from instant_ic.bag.message import BagMessage
 from instant_ic.bag.transforms import TRANSFORM_TOPICS
@@ -27,6 +29,27 @@ class LatchedValues:
         topic, names = ("", frozenset[str]()) if but is None else (but.topic, _names(but))
         kept = [v for key, v in self._values.items() if not (key[0] == topic and key[1] <= names)]
         return sorted(kept, key=lambda value: value.stamp_ns)
+
+
+class Repetitions:
+    """Finds the latched values with which a later file of a bag only repeats those of an earlier one.
+
+    Args:
+        starts_ns: stamp of the first message of each file but the first; may grow.
+    """
+
+    def __init__(self, starts_ns: Iterable[int] = ()) -> None:
+        self.starts_ns = set(starts_ns)
+        self._seen: set[int] = set()  # hashes: a map has megabytes
+
+    def repeats(self, message: BagMessage) -> bool:
+        """Note a message; return whether it repeats an earlier one."""
+        if not message.qos.latched:
+            return False
+        value = hash((message.topic, message.payload))
+        repeated = message.stamp_ns in self.starts_ns and value in self._seen
+        self._seen.add(value)
+        return repeated
 
 
 def _names(message: BagMessage) -> frozenset[str]:

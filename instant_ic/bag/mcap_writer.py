@@ -10,7 +10,6 @@ import os
 import struct
 from collections import Counter
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -18,33 +17,17 @@ from mcap.opcode import Opcode
 from mcap.writer import MCAP0_MAGIC as MAGIC
 from mcap.writer import CompressionType, Writer
 
+from instant_ic.bag.message import Topic
+from instant_ic.bag.metadata import Topics, channel_metadata
 from instant_ic.util.private import open_file
 
 CHUNK_BYTES = 1 << 20
 """A chunk is closed once it is larger than this."""
 
-LIBRARY = "instant_ic"
 _END = struct.pack("<BQI", Opcode.DATA_END, 4, 0) + struct.pack("<BQQQI", Opcode.FOOTER, 20, 0, 0, 0) + MAGIC
 """End of a file without an index, as the format allows."""
 
 Buffer = bytes | memoryview
-
-
-@dataclass(frozen=True)
-class Schema:
-    """Definition of a message type in a bag.
-
-    Attributes:
-        name: type name, for example ``sensor_msgs/msg/Image``.
-        encoding: ``ros2msg`` or ``ros2idl``; empty where the definition is unknown.
-        text: the definition, including those of nested types.
-        type_hash: RIHS01 hash; empty where it is unknown.
-    """
-
-    name: str
-    encoding: str
-    text: str
-    type_hash: str
 
 
 class _File:
@@ -78,29 +61,37 @@ class McapWriter:
 
     Args:
         path: the file, which must not exist; only its owner can read it.
+        topics: QoS and type of each topic; may grow.
         compressed: compress chunks with zstd.
 
     Attributes:
-        counts: messages in complete chunks on the disk, by channel.
+        given: messages passed to :meth:`write`, by topic.
+        counts: messages in complete chunks on the disk, by topic.
+        first_ns: stamp of the first message; None before it.
         span_ns: first and last stamp in complete chunks; (0, 0) if there are none.
 
     Raises:
         OSError: the file cannot be created.
     """
 
-    def __init__(self, path: Path, compressed: bool = False) -> None:
+    def __init__(self, path: Path, topics: Topics, compressed: bool = False) -> None:
         self.path = path
-        self.counts: Counter[int] = Counter()
+        self._topics = topics
+        self.given: Counter[Topic] = Counter()
+        self.counts: Counter[Topic] = Counter()
+        self.first_ns: int | None = None
         self.span_ns = (0, 0)
+        self._schemas: dict[str, int] = {}
+        self._channels: dict[Topic, int] = {}
         self._file = _File(path)
         self._complete = 0  # end of the last complete chunk
         self._failure: OSError | None = None
-        self._open: list[tuple[int, int]] = []  # channel and stamp of each message in the open chunk
+        self._open: list[tuple[Topic, int]] = []  # topic and stamp of each message in the open chunk
         self._open_bytes = 0
         compression = CompressionType.ZSTD if compressed else CompressionType.NONE
         self._writer = Writer(self._file, CHUNK_BYTES, compression)
         try:
-            self._put(self._writer.start, "ros2", LIBRARY)
+            self._put(self._writer.start, "ros2", "instant_ic")
         except OSError:
             os.close(self._file.fd)
             path.unlink(missing_ok=True)
@@ -111,24 +102,43 @@ class McapWriter:
         """Bytes so far; the open chunk counts uncompressed."""
         return self._file.offset + self._open_bytes
 
-    def add_schema(self, schema: Schema) -> int:
-        """Add a message type and return its number in this file."""
-        self._open_bytes += len(schema.text)
-        return int(self._put(self._writer.register_schema, schema.name, schema.encoding, schema.text.encode()))
+    @property
+    def lost(self) -> Counter[str]:
+        """Messages by topic outside complete chunks; after :meth:`finish`, those that did not reach the disk."""
+        lost: Counter[str] = Counter()
+        for (name, _), count in (self.given - self.counts).items():
+            lost[name] += count
+        return lost
 
-    def add_channel(self, topic: str, schema: int, metadata: Mapping[str, str]) -> int:
-        """Add a topic with its type and return its number in this file."""
-        return int(self._put(self._writer.register_channel, topic, "cdr", schema, dict(metadata)))
+    def add_topic(self, topic: Topic) -> int:
+        """Add a topic with its type, once; return its number in this file.
 
-    def write(self, channel: int, stamp_ns: int, payload: Buffer, publish_ns: int | None = None) -> None:
+        Raises:
+            OSError: the disk is full.
+        """
+        if topic not in self._channels:
+            qos, schema = self._topics[topic]
+            if schema.name not in self._schemas:
+                self._open_bytes += len(schema.text)
+                definition = (schema.name, schema.encoding, schema.text.encode())
+                self._schemas[schema.name] = self._put(self._writer.register_schema, *definition)
+            channel = (topic[0], "cdr", self._schemas[schema.name], channel_metadata(qos))
+            self._channels[topic] = self._put(self._writer.register_channel, *channel)
+        return self._channels[topic]
+
+    def write(self, topic: Topic, stamp_ns: int, payload: Buffer) -> None:
         """Append one message.
 
         Raises:
             OSError: the disk is full; the file then ends with the last complete chunk.
         """
-        self._open.append((channel, stamp_ns))
+        self.given[topic] += 1
+        if self.first_ns is None:
+            self.first_ns = stamp_ns
+        channel = self.add_topic(topic)
+        self._open.append((topic, stamp_ns))
         self._open_bytes += len(payload)
-        self._put(self._writer.add_message, channel, stamp_ns, payload, stamp_ns if publish_ns is None else publish_ns)
+        self._put(self._writer.add_message, channel, stamp_ns, payload, stamp_ns)
 
     def add_metadata(self, name: str, values: Mapping[str, str]) -> None:
         """Write a metadata record before the open chunk.
@@ -202,5 +212,5 @@ class McapWriter:
         stamps = [stamp_ns for _, stamp_ns in self._open]
         first, last = min(stamps), max(stamps)
         self.span_ns = (min(first, self.span_ns[0]), max(last, self.span_ns[1])) if self.counts else (first, last)
-        self.counts.update(channel for channel, _ in self._open)
+        self.counts.update(topic for topic, _ in self._open)
         self._open, self._open_bytes = [], 0

@@ -1,10 +1,13 @@
-"""One message, as every part of the package handles it: bytes with topic, type, stamp and QoS. Errors of bags."""
+"""A bag's message as bytes with topic, type, stamp and QoS, the definition of its type, and the errors of bags."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
 from instant_ic.bus.qos import QoS
+
+Topic = tuple[str, str]
+"""Topic name and type."""
 
 
 class BagError(RuntimeError):
@@ -13,6 +16,23 @@ class BagError(RuntimeError):
 
 class DiskFullError(BagError):
     """No space left on the disk. The bag is complete except for the messages that did not fit."""
+
+
+@dataclass(frozen=True)
+class Schema:
+    """Definition of a message type in a bag.
+
+    Attributes:
+        name: type name, for example ``sensor_msgs/msg/Image``.
+        encoding: ``ros2msg`` or ``ros2idl``; empty where the definition is unknown.
+        text: the definition, including those of nested types.
+        type_hash: RIHS01 hash; empty where it is unknown.
+    """
+
+    name: str
+    encoding: str
+    text: str
+    type_hash: str
 
 
 @dataclass(frozen=True)

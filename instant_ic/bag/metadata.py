@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-import json
-from collections.abc import Collection, Sequence
-from dataclasses import dataclass, field
+from collections import Counter
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import yaml
 from rosbags.interfaces import (
@@ -25,67 +24,44 @@ from rosbags.rosbag2 import ReaderError
 from rosbags.rosbag2.metadata import dump_qos_v9, parse_qos
 from rosbags.typesys import TypesysError
 
-from instant_ic.bag.mcap_writer import Schema
+from instant_ic.bag.message import Schema, Topic
 from instant_ic.bus.qos import LATCHED, RELIABLE, SENSOR, QoS
 from instant_ic.config.yaml_text import dump_yaml, read_yaml
 from instant_ic.msg import MessageError, message_type, type_hash, typestore
 from instant_ic.util.files import replacing
 
 METADATA_FILE = "metadata.yaml"
-REPEATED = "instant_ic.repeated"
-"""Key of ``custom_data``: JSON, file → its latched messages that only repeat those of an earlier file:
-``{"stamp_ns": their stamp, "topics": {topic: count}}``."""
-
 # The values that DDS writes for "no limit" and rosbag2 for the start of an empty bag.
 _FOREVER = QosTime(2147483647, 4294967295)
 _NO_START = (1 << 63) - 1
 
-Topic = tuple[str, str]
-"""Topic name and type."""
+Topics = dict[Topic, tuple[QoS, Schema]]
+"""QoS and type of the topics of a bag."""
 
 
-@dataclass
-class PartInfo:
-    """One file of a bag.
-
-    Attributes:
-        path: file name in the bag's folder.
-        counts: messages by topic, including repeated ones.
-        repeated: topic → latched messages at the start of the file that repeat those of an earlier file.
-        repeated_ns: stamp of the repeated messages in this file.
-    """
-
-    path: str
-    start_ns: int = 0
-    end_ns: int = 0
-    counts: dict[Topic, int] = field(default_factory=dict)
-    repeated: dict[str, int] = field(default_factory=dict)
-    repeated_ns: int = 0
+class WrittenFile(Protocol):
+    """A complete file of a bag, see :class:`McapWriter`."""
 
     @property
-    def count(self) -> int:
-        return sum(self.counts.values())
+    def path(self) -> Path: ...
+    @property
+    def counts(self) -> Counter[Topic]: ...
+    @property
+    def span_ns(self) -> tuple[int, int]: ...
 
 
-def write_metadata(
-    folder: Path,
-    parts: Sequence[PartInfo],
-    topics: dict[Topic, tuple[QoS, Schema]],
-    custom: dict[str, str],
-) -> None:
+def write_metadata(folder: Path, files: Sequence[WrittenFile], topics: Topics, custom: Mapping[str, str]) -> None:
     """Write ``metadata.yaml`` (rosbag2, version 9) atomically: readers see either the old or the new file.
 
     Raises:
         OSError: the file cannot be written.
     """
-    repeated = {part.path: {"stamp_ns": part.repeated_ns, "topics": part.repeated} for part in parts if part.repeated}
-    custom = {**custom, **({REPEATED: json.dumps(repeated)} if repeated else {})}
     information = {
         "version": 9,
         "storage_identifier": "mcap",
-        "relative_file_paths": [part.path for part in parts],
-        **_span(parts),
-        "message_count": sum(part.count for part in parts),
+        "relative_file_paths": [file.path.name for file in files],
+        **_span(files),
+        "message_count": sum(file.counts.total() for file in files),
         "topics_with_message_count": [
             {
                 "topic_metadata": {
@@ -95,25 +71,25 @@ def write_metadata(
                     "offered_qos_profiles": dump_qos_v9([ros_qos(qos)]),
                     "type_description_hash": schema.type_hash,
                 },
-                "message_count": sum(part.counts.get((topic, type_name), 0) for part in parts),
+                "message_count": sum(file.counts[topic, type_name] for file in files),
             }
             for (topic, type_name), (qos, schema) in topics.items()
         ],
         "compression_format": "",
         "compression_mode": "",
-        "files": [{"path": part.path, **_span([part]), "message_count": part.count} for part in parts],
-        "custom_data": custom or None,
+        "files": [{"path": file.path.name, **_span([file]), "message_count": file.counts.total()} for file in files],
+        "custom_data": dict(custom) or None,
         "ros_distro": "jazzy",
     }
     text = dump_yaml({"rosbag2_bagfile_information": information}, width=1000)
-    with replacing(folder / METADATA_FILE, private=True, sync=True) as file:
-        file.write(text.encode())
+    with replacing(folder / METADATA_FILE, private=True, sync=True) as stream:
+        stream.write(text.encode())
 
 
-def _span(parts: Sequence[PartInfo]) -> dict[str, Any]:
-    filled = [part for part in parts if part.count]
-    start_ns = min((part.start_ns for part in filled), default=_NO_START)
-    end_ns = max((part.end_ns for part in filled), default=_NO_START)
+def _span(files: Sequence[WrittenFile]) -> dict[str, Any]:
+    spans = [file.span_ns for file in files if file.counts]
+    start_ns = min((start_ns for start_ns, _ in spans), default=_NO_START)
+    end_ns = max((end_ns for _, end_ns in spans), default=_NO_START)
     return {
         "duration": {"nanoseconds": end_ns - start_ns},
         "starting_time": {"nanoseconds_since_epoch": start_ns},

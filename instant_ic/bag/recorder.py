@@ -274,7 +274,7 @@ class Recorder:
             "disk_full": dict(self._thread.lost()),
         }
         if writer is not None:
-            status |= {"bytes": writer.bytes, "files": writer.parts}
+            status |= {"bytes": writer.bytes, "files": writer.files}
         if cache is not None:
             status |= {"cached_bytes": cache.bytes, "cached_s": round(cache.span_s, 1)}
             status["snapshots"] = [{"path": str(s.path), "state": s.state, "words": s.words} for s in self.snapshots]

@@ -211,7 +211,7 @@ class RecorderThread:
             words = f"only {free / 1e6:.0f} MB are free for {self.path}, {self._reserve / 1e6:.0f} MB are the reserve"
             if self.writer is not None:
                 self.set_custom(self.writer)
-                self.writer.end_part()
+                self.writer.end_file()
             self._stop(DISK_FULL, f"{words}: not recording; the bag is complete up to here")
         elif self.state == DISK_FULL and free >= self._reserve + _ROOM_AGAIN:
             log.warning(
@@ -229,7 +229,7 @@ class RecorderThread:
         if self.writer is None:
             self.state = ENDED
             return
-        for step in (self.writer.end_part, self.writer.close):  # the second writes what the first has lost
+        for step in (self.writer.end_file, self.writer.close):  # the second writes what the first has lost
             self.set_custom(self.writer)
             try:
                 step()

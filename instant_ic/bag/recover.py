@@ -6,8 +6,9 @@ import re
 from dataclasses import dataclass
 from pathlib import Path
 
+from instant_ic.bag.latched import Repetitions
 from instant_ic.bag.mcap_scan import McapScan
-from instant_ic.bag.message import BagError
+from instant_ic.bag.message import BagError, BagMessage
 from instant_ic.bag.metadata import preset_of_text, with_hash
 from instant_ic.bag.writer import CUSTOM_RECORD, BagWriter
 
@@ -42,24 +43,30 @@ def recover(source: Path, target: Path) -> Recovered:
     stopped_by: list[str] = []
     damaged: list[str] = []
     skipped: dict[str, str] = {}
+    repetitions = Repetitions()
+    count = 0
     # Sorted only within chunks, and chunks of a recorder may overlap slightly: readers sort by the new index.
     with BagWriter(target) as writer:
         for number, file in enumerate(files):
             scan = McapScan(file)
-            for message in scan.messages():
-                if message.encoding != "cdr":
-                    skipped[message.topic] = f"encoding {message.encoding!r}"
-                elif not message.repeated:  # the writer adds its own repetitions
-                    qos = preset_of_text(message.metadata.get("offered_qos_profiles", ""))
-                    schema = with_hash(message.schema)
-                    writer.write(message.topic, schema.name, message.payload, message.stamp_ns, qos, schema)
+            for position, found in enumerate(scan.messages()):
+                channel, schema = found.channel, with_hash(found.schema)
+                if channel.message_encoding != "cdr":
+                    skipped[channel.topic] = f"encoding {channel.message_encoding!r}"
+                    continue
+                if number and not position:
+                    repetitions.starts_ns.add(found.stamp_ns)
+                qos = preset_of_text(channel.metadata.get("offered_qos_profiles", ""))
+                message = BagMessage(channel.topic, schema.name, found.payload, found.stamp_ns, qos)
+                if not repetitions.repeats(message):  # the writer adds its own repetitions
+                    writer.write(message.topic, message.type_name, message.payload, message.stamp_ns, qos, schema)
+                    count += 1
             for key, value in scan.metadata.get(CUSTOM_RECORD, {}).items():
                 writer.set_custom(key, value)
             damaged += [f"{file.name}, {words}" for words in scan.damaged]
             stopped_by += [scan.stopped_by] if scan.stopped_by else []
             if number < len(files) - 1:
-                writer.end_part()
-        count = writer.count
+                writer.end_file()
         writer.set_custom("recovered_from", source.name)
     why = "; ".join(stopped_by)
     if count == 0:

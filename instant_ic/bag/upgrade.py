@@ -6,7 +6,7 @@ import functools
 from collections.abc import Callable
 from typing import Any
 
-from instant_ic.bag.mcap_writer import Schema
+from instant_ic.bag.message import Schema
 from instant_ic.bag.metadata import schema_or_unknown, store_of
 from instant_ic.msg import message_type, serialize, typestore
 

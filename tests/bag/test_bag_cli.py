@@ -44,9 +44,9 @@ def test_info(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     assert "left out because the disk was too slow: /scan 7" in out
     status, out, _ = ic(capsys, "bag", "info", bag, "--json")
     told = json.loads(out)
-    assert (told["messages"], told["duration_s"], len(told["files"])) == (11, 9.0, 2)
+    assert (told["messages"], told["duration_s"], len(told["files"])) == (12, 9.0, 2)
     assert {t["topic"]: (t["messages"], t["lost_by"]) for t in told["topics"]} == {
-        "/operator/estop": (1, {}),
+        "/operator/estop": (2, {}),  # each file begins with it
         "/scan": (10, {"front": 3}),
     }
 

@@ -682,8 +682,7 @@ def _map_yaml() -> Target:
     samples = [
         b"image: map.pgm\nmode: trinary\nresolution: 0.05\norigin: [0.0, 0.0, 0.0]\nnegate: 0\n"
         b"occupied_thresh: 0.65\nfree_thresh: 0.25\n",
-        b"image: map.pgm\nresolution: 0.05\norigin: [-1, 2, 0]\nnegate: 1\n"
-        b"occupied_thresh: 0.9\nfree_thresh: 0.1\n",
+        b"image: map.pgm\nresolution: 0.05\norigin: [-1, 2, 0]\nnegate: 1\noccupied_thresh: 0.9\nfree_thresh: 0.1\n",
     ]
 
     def parse(path: Path) -> None:

@@ -10,7 +10,7 @@ import cv2
 import pytest
 
 from instant_ic.bag import BagReader, BagWriter
-from instant_ic.bag.mcap_writer import Schema
+from instant_ic.bag.message import Schema
 from instant_ic.bag.metadata import preset_of_text, schema_or_unknown, with_hash
 from instant_ic.bag.recover import recover
 from instant_ic.bus.qos import RELIABLE, SENSOR
