@@ -44,7 +44,7 @@ class CaptureReplay:
         if not datagrams:
             raise ValueError(f"pcap {path} has no VLP-16 packets (UDP payloads of 1206 or 512 bytes)")
         first = min(d.stamp_ns for d in datagrams)
-        # Sorted by time only: packets with equal stamps keep their order, or the driver would count them as late.
+        # The sort is stable: packets with equal stamps keep their order, or the driver would count them as late.
         self._items = sorted(
             (((d.stamp_ns - first) * 1e-9, (host, ports[len(d.payload)]), d.payload) for d in datagrams),
             key=lambda item: item[0],
@@ -54,7 +54,7 @@ class CaptureReplay:
         self._period_s = self.duration_s * (count + 1) / count if count > 1 else 0.1
         self._next = 0
         self._began_s = 0.0
-        self._rng: np.random.Generator | None = None  # from the second time on
+        self._rng: np.random.Generator | None = None  # used from the second pass on
         self.sent = 0
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_BROADCAST, 1)

@@ -28,7 +28,7 @@ JPEG_QUALITY = 92
 #: Standard deviation of the sensor's noise, of 255: no two images are equal. It makes a JPEG 2 % larger.
 NOISE = 1.0
 _NOISE_STEP = 389
-"""Columns by which the noise moves from image to image: a prime, so that it returns after the whole width only."""
+"""Columns by which the noise moves from image to image: a prime, so that it repeats only after the whole width."""
 #: Time after setting options during which the preview is not ready, seconds.
 SETTLE_S = 0.8
 
@@ -112,7 +112,7 @@ class ThetaServer:
         self.frames = 0
         self.late_s = 0.0
         self._options = ThetaOptions(next(f for f in PREVIEW_FORMATS if f[:2] == (config.width, config.height)))
-        # As the driver left them when it last ran: a camera that stays on keeps its options.
+        # Options as the driver left them in its last run: a camera that stays on keeps them.
         self._options.set({"sleepDelay": NEVER, "offDelay": NEVER})
         self._options_set_s = -1e9
         self._frame: bytes | None = None
@@ -166,8 +166,8 @@ class ThetaServer:
         height, width = rgb.shape[:2]
         if self._noise.shape[:2] != (height, 2 * width):
             self._noise = np.rint(self._rng.normal(0.0, NOISE, (height, 2 * width, 3))).astype(np.int8)
-        # Each place once in turn: at random, one of the last hundred would come again soon, and the image of a standing
-        # robot would be equal to an earlier one.
+        # The offsets take turns: at random, one of them would soon be repeated, and the image of a standing robot would
+        # be equal to an earlier one.
         self._noise_first = (self._noise_first + _NOISE_STEP) % width
         first = self._noise_first
         noisy = cv2.add(rgb, self._noise[:, first : first + width], dtype=cv2.CV_8U)
@@ -201,14 +201,16 @@ class ThetaServer:
             period = 1.0 / min(self.config.rate, promised)
             # If rendering takes too long, the camera delivers fewer images, never old ones.
             due += period
-            late_s = min(max(late_s, current().steady_s() - due, 0.0), period)  # one late image is no slow machine
+            late_s = min(
+                max(late_s, current().steady_s() - due, 0.0), period
+            )  # a single late image does not mean a slow machine
             self.late_s = 0.5 * self.late_s + 0.5 * late_s
             due = max(due, current().steady_s())
             self._sleep(due)
             took = current().steady_s() - began
             made += 1
             period_s = took if made == 1 else 0.8 * period_s + 0.2 * took
-            # The first images are late for many reasons, so the rate is reported only after them.
+            # The first images are late at any start, so the rate is reported only after them.
             if made >= 5:
                 self.rate_hz = 1 / period_s
 
