@@ -87,21 +87,21 @@ class Arbiter:
         self._fresh_since_ns: int | None = None
         self._agree_since_ns: int | None = None
         self._slow_since_ns: int | None = None  # the v-bot drives slower than commanded since then
-        self._ready: tuple[Vspace, int] | None = None  # the v-space when it was last ready, and when
+        self._ready: tuple[Vspace, int] | None = None  # last ready state of the virtual space, and its time
         self._leading_back = False
         self._no_view_fits = False  # the last entry was abandoned
         self._hard = False  # the last command was a hard stop
         self._yaw_gap_before = 0.0  # in the previous step
-        self._stopped_for_pose = False  # since the pose was last trusted
-        self._poses_before: dict[str, tuple[NDArray[np.float64], int]] = {}  # by robot, and when: the previous step
-        self._contradictions = 0  # those that the robot has been stopped for
-        self._stopped_by = Notice(Reason.STARTING, "waiting for the sensors")
+        self._stopped_for_pose = False  # for a pose that has not been trusted since
+        self._poses_before: dict[str, tuple[NDArray[np.float64], int]] = {}  # previous pose and its time, by robot
+        self._contradictions = 0  # number of contradictions that have stopped the robot
+        self._stopped_by = Notice(Reason.STARTING, "The robot waits for its sensors.")
         self._awaits_operator = False  # STOPPED until an operator's command shows that no key is held
         self._operator = OperatorCommands()
         self._interruptions = Interruptions()
         self._interrupted: Notice | None = None  # since the previous step
         self._vbot_start: NDArray[np.float64] = np.zeros(3)
-        self._passage: tuple[Notice | None, int] | None = None  # reason against it, and when it was looked for
+        self._passage: tuple[Notice | None, int] | None = None  # reason against a way round, and when it was found
         self._actions: dict[str, Callable[[Snapshot, int], None]] = {
             "stop": self._stop,
             "call_vbot": _nothing,
@@ -115,7 +115,7 @@ class Arbiter:
     def reconfigure(self, config: ArbiterConfig) -> None:
         """Apply other parameters from the next step on; mode and history stay."""
         predictor, rules = Predictor(config.prediction, config.limits, config.footprint), CommandRules(config)
-        # Nothing changes before this line: the values may be unusable.
+        # From here on nothing fails: unusable values have raised above.
         self.config, self.predictor, self.rules = config, predictor, rules
         self._sources = SourceMonitor(config)
         self._planner = HybridPlanner(config.planner, config.footprint)
@@ -131,7 +131,7 @@ class Arbiter:
         row = next((row for row in rows if GUARD_FUNCTIONS[row.guard](snapshot)), None)
         if row is not None:
             self._take(row, snapshot, now_ns)
-            # The driven robot has changed, and with it prediction and gap.
+            # Prediction and gap are now those of another driven robot.
             snapshot = self.assess(inputs, now_ns)
         self._yaw_gap_before = snapshot.yaw_gap_rad
         if self.mode == Mode.STOPPED:
@@ -175,7 +175,7 @@ class Arbiter:
         longest_s, operator = self.config.timeouts.stop_after_s, self._operator
         found = self._interruptions.step(now_ns, inputs.suspended_ns, inputs.instances, longest_s)
         if found is not None or self._interruptions.gap_s:
-            # Nobody has looked meanwhile.
+            # The sources were not watched during the gap.
             self._fresh_since_ns = self._agree_since_ns = self._slow_since_ns = None
             operator.forget_zeros()
         fresh = self._sources.command_is_fresh(inputs)
@@ -215,7 +215,7 @@ class Arbiter:
     # -- assessing the inputs
 
     def assess(self, inputs: ArbiterInputs, now_ns: int) -> Snapshot:
-        """Return the snapshot of this step; keeps the instants from which its durations count."""
+        """Return the snapshot of this step, and update the start times of its durations."""
         in_mode_s = self._since_s(self._since_ns, now_ns, 0.0)
         operator = self._operator
         if inputs.vspace.ready:
@@ -225,7 +225,7 @@ class Arbiter:
         self._fresh_since_ns = None if stale_in_real else _kept(self._fresh_since_ns, now_ns)
         target = _target(inputs)
         vbot = self._vbot_pose(inputs, target, in_mode_s)
-        # Compared with the r-bot as shown, not as it is: the two images that the operator sees must agree.
+        # The gap is measured to the r-bot as shown: the two images that the operator sees must agree.
         gap_m, yaw_gap_rad = float(np.linalg.norm(vbot[:2] - target[:2])), wrap_angle(float(vbot[2] - target[2]))
         agree = self.mode == Mode.VIRTUAL and inputs.robot_pose is not None and self._poses_agree(gap_m, yaw_gap_rad)
         self._agree_since_ns = _kept(self._agree_since_ns, now_ns) if agree else None
@@ -288,7 +288,7 @@ class Arbiter:
 
     def _contradicted(self, inputs: ArbiterInputs) -> bool:
         """Return whether wheels and LiDAR contradict each other, and the robot has not been stopped for it yet."""
-        self._contradictions = min(self._contradictions, inputs.contradictions)  # a new SLAM counts from 0
+        self._contradictions = min(self._contradictions, inputs.contradictions)  # a restarted SLAM counts from 0
         return inputs.contradictions > self._contradictions
 
     def _vbot_jumps(self, pose: NDArray[np.float64], now_ns: int) -> bool:
@@ -365,7 +365,7 @@ class Arbiter:
         return s.agree_s < 0.0 and abs(linear) < STANDS_M_S and abs(angular) < STANDS_RAD_S
 
     def _against_switch(self, s: Snapshot, now_ns: int) -> Notice | None:
-        """Return the reason against a switch, where the question arises: in REAL, with an obstacle ahead."""
+        """Return the reason against a switch in REAL with an obstacle ahead; None without one."""
         if s.mode != Mode.REAL or not s.obstacle_ahead:
             return None
         if estop_pressed(s):
@@ -414,5 +414,5 @@ def _vbot_action(s: Snapshot) -> VbotAction:
     if s.mode != Mode.VIRTUAL:
         return VbotAction.WITH_ROBOT
     if s.settles or any(stale.source.key in ("view", "command") for stale in s.stale):
-        return VbotAction.HELD  # nobody sees it, or nobody drives it
+        return VbotAction.HELD  # the operator does not see it, or does not drive it
     return VbotAction.LED_BACK if s.leading_back else VbotAction.DRIVEN

@@ -77,7 +77,7 @@ class PoseTrustConfig:
     Attributes:
         slow: probability of being lost from which the r-bot drives slowly and does not switch.
         stop: probability of being lost from which the r-bot stops, until the operator lets go of the controls.
-        speed_m_s: speed limit in m/s from the first of the two on.
+        speed_m_s: speed limit in m/s from ``slow`` on.
         jump_m: m; a jump of the pose by more than this, and than the robot can have driven meanwhile, stops the r-bot
             as a lost pose does: it was carried off, or its pose was wrong.
         jump_deg: degrees; as jump_m, for the heading.

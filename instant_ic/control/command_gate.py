@@ -1,4 +1,4 @@
-"""May this command drive? The checks that every receiver of a drive command shares.
+"""Checks of a drive command, shared by every receiver.
 
 A command passes if
 
@@ -6,9 +6,9 @@ A command passes if
 2. its sender has the right to drive (:class:`~instant_ic.control.robot_lease.Lease`), where the gate has a lease;
 3. it is recent: neither too old, nor stamped ahead of the receiver's clock, nor without a stamp.
 
-Each receiver asks for what it alone knows in addition. The console has an explicit driver, who is the page that took
-control, and numbered commands. The base obeys one node by its name. The arbiter takes an old command of the driver: it
-follows the command's age from then on, and stops the robot by it.
+Each receiver adds checks of its own. The console has an explicit driver, the page that took control, and numbered
+commands. The base obeys one node by its name. The arbiter accepts an old command of the driver: it watches the age of
+the command, and stops the robot by it.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ class GateLimits:
 
 
 class CommandGate:
-    """Decides whether a command may drive; knows no bus and no clock.
+    """Checks whether a command may drive; independent of bus and clock.
 
     Args:
         limits: limits of the commands.
@@ -79,7 +79,7 @@ class CommandGate:
             return self.refuse(Verdict.NOT_FINITE, f"age of the command is not finite ({age_s} s)")
         if age_s > limits.max_age_s:
             return self.refuse(Verdict.OLD, f"command is {age_s:.2f} s old, at most {limits.max_age_s:g} s allowed")
-        if age_s < -limits.max_ahead_s:  # a stamp in the future proves no freshness
+        if age_s < -limits.max_ahead_s:  # a stamp in the future does not prove that the command is recent
             return self.refuse(Verdict.FUTURE, f"command's stamp is {-age_s:.2f} s ahead: set the clocks")
         return None
 
@@ -109,7 +109,7 @@ class CommandGate:
             return refusal
         if self.lease is None:
             return self.check_age(age_s)
-        # An old command, too, shows that a control is held: the lease notes it before the age is checked.
+        # The lease comes before the age: an old command also shows that a control is held.
         denied = self.lease.refusal(sender, (v, w) != (0.0, 0.0), now_ns, stands)
         if (refusal := self.check_age(age_s)) is not None:
             return refusal

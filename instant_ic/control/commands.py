@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from instant_ic.control.arbiter_config import ArbiterConfig
-from instant_ic.control.guards import hold
+from instant_ic.control.guards import POSE_UNKNOWN, hold
 from instant_ic.control.reasons import Notice, stale_notice
 from instant_ic.control.safety import CollisionMonitor, MonitoredCommand
 from instant_ic.control.snapshot import NO_MOTION, ArbiterInputs, Snapshot, Twist2
@@ -17,6 +17,7 @@ from instant_ic.control.states import Mode, Reason
 
 _SLOW_S = 0.8
 """Longer than the v-bot takes to reach full speed."""
+_NEAR_OBSTACLE = " The robot slows down near an obstacle."
 
 
 @dataclass(frozen=True)
@@ -40,7 +41,7 @@ class CommandRules:
         self.sources = SourceMonitor(config)
 
     def command(self, s: Snapshot, stopped_by: Notice) -> DriveCommand:
-        """Return the command of the present state; ``stopped_by``: what led to STOPPED."""
+        """Return the command of the present state; ``stopped_by`` is the reason of STOPPED."""
         if s.mode == Mode.STOPPED:
             return DriveCommand(NO_MOTION, why_stopped(s, stopped_by), hard=True)
         held = hold(s)
@@ -49,7 +50,7 @@ class CommandRules:
         sent = self._virtual(s) if s.mode == Mode.VIRTUAL else self._real(s)
         ahead, behind = s.inputs.blind
         if (ahead and sent.twist[0] > 0.0) or (behind and sent.twist[0] < 0.0):
-            text = f"the LiDAR is covered {'ahead' if ahead else 'behind'}: uncover it, or drive another way"
+            text = f"The LiDAR is covered {'ahead' if ahead else 'behind'}. Uncover it, or drive another way."
             return DriveCommand(NO_MOTION, Notice(Reason.BLIND, text), blocked=True, hard=True)
         return sent
 
@@ -57,59 +58,59 @@ class CommandRules:
         """Return the path follower's command; the operator drives the v-bot."""
         hard = not s.fresh
         if s.leading_back:
-            text = "no command: the view goes back to the robot; drive to continue"
+            text = "No command: the view goes back to the robot. Drive to continue."
             return DriveCommand(NO_MOTION, Notice(Reason.LEADING_BACK, text), hard=hard)
-        text = "you drive the virtual robot" + _far_from_keyframe(s)
+        text = "You drive the virtual robot." + _far_from_keyframe(s)
         if s.subgoal is None:
-            text += "; no free place for the robot near it"
+            text += " The robot has no free place near it."
             return DriveCommand(NO_MOTION, Notice(Reason.NO_SUBGOAL, text), hard=hard)
         wanted = self.config.limits.clip(*s.inputs.nav_command)
         if s.inputs.age("nav") > self.config.timeouts.nav:
-            wanted = NO_MOTION  # at first: the follower has not sent a command yet
+            wanted = NO_MOTION  # the follower has not sent its first command yet
         sent = self.monitored(self._paced(wanted, s), s.inputs)
         notice = Notice(Reason.DRIVE_VBOT, text)
         left_s = self.config.switch.lead_back_after_s - s.idle_s
         if s.agree_s < 0.0 and 0.0 < left_s < self.config.switch.lead_back_after_s - 1.0:
-            text = f"the robot cannot reach your place: the view goes back to the robot in {left_s:.0f} s"
+            text = f"The robot cannot reach your place. The view goes back to the robot in {left_s:.0f} s."
             notice = Notice(Reason.ROBOT_CANNOT_FOLLOW, text)
         elif sent.action != "free":
-            notice = Notice(Reason.DRIVE_VBOT, text + "; the robot slows down near an obstacle")
+            notice = Notice(Reason.DRIVE_VBOT, text + _NEAR_OBSTACLE)
         elif slowed := self.sources.slowed(s.inputs, s.mode, abs(s.command[0])):
             notice = Notice(Reason.DRIVE_VBOT, text + slowed)
         elif s.slow_s > _SLOW_S:
-            notice = Notice(Reason.DRIVE_VBOT, text + "; slowed: a wall is ahead, or the robot must catch up")
+            notice = Notice(Reason.DRIVE_VBOT, text + " It is slow: a wall is ahead, or the robot must catch up.")
         return DriveCommand(sent.command, notice, hard=hard or sent.action == "stop")
 
     def _real(self, s: Snapshot) -> DriveCommand:
         """Return the operator's command, slowed before an obstacle and during a switch."""
-        command, blocked, notice = s.command, False, Notice(Reason.DRIVE_ROBOT, "you drive the robot")
+        command, blocked, notice = s.command, False, Notice(Reason.DRIVE_ROBOT, "You drive the robot.")
         if s.prediction is not None and s.obstacle_ahead and command != NO_MOTION:
             command = self._slowed(command, s.prediction.distance_m, s.predictor.reach_m)
             if s.mode == Mode.REAL:
                 blocked = True
-                why = s.against_switch or Notice(Reason.OBSTACLE_AHEAD, "obstacle ahead")
-                notice = why.prefixed(f"blocked: obstacle in {s.prediction.distance_m:.1f} m; ")
+                reason, why = s.against_switch or (Reason.OBSTACLE_AHEAD, "Drive another way.")
+                notice = Notice(reason, f"Obstacle in {s.prediction.distance_m:.1f} m. {why}")
         if s.mode == Mode.ENTERING:
-            notice = Notice(Reason.SWITCHING_TO_VIRTUAL, "obstacle ahead: switching to the virtual space")
+            notice = Notice(Reason.SWITCHING_TO_VIRTUAL, "Obstacle ahead. Switching to the virtual space.")
             waited = s.in_mode_s / self.config.switch.enter_timeout_s
             left = max(0.0, 1.0 - waited**2)  # hardly noticed if the view comes in time
             command = (command[0] * left, command[1] * left)
         elif s.mode == Mode.RETURNING:
-            notice = Notice(Reason.SWITCHING_TO_CAMERA, "you drive the robot; switching back to the camera")
+            notice = Notice(Reason.SWITCHING_TO_CAMERA, "You drive the robot. Switching back to the camera.")
         paced = self._paced(command, s)
         if not blocked and s.pose_doubtful:
-            text = "the robot is not sure of its place: drive slowly, by the camera, until it is recognized"
+            text = "The robot is not sure of its place. Drive slowly, by the camera, until it is recognized."
             notice = Notice(notice.reason, text)
         elif not blocked and s.must_be_slow:
-            notice = Notice(notice.reason, f"{s.inputs.contradiction.text}; slow until they agree")
+            notice = Notice(notice.reason, f"{s.inputs.contradiction.text} The robot is slow until both agree.")
         elif not blocked:
             notice = Notice(notice.reason, notice.text + self.sources.slowed(s.inputs, s.mode, abs(command[0])))
         sent = self.monitored(paced, s.inputs)
         if sent.action in ("approach", "stop") and not blocked:
             blocked = True
-            notice = Notice(Reason.CONTACT, f"blocked: contact in {sent.time_to_collision_s:.1f} s")
+            notice = Notice(Reason.CONTACT, f"Contact in {sent.time_to_collision_s:.1f} s. Drive another way.")
         elif sent.action != "free" and not blocked:
-            notice = Notice(notice.reason, notice.text + "; slowed down near an obstacle")
+            notice = Notice(notice.reason, notice.text + _NEAR_OBSTACLE)
         return DriveCommand(sent.command, notice, blocked, hard=not s.fresh or sent.action == "stop")
 
     def monitored(self, command: Twist2, inputs: ArbiterInputs) -> MonitoredCommand:
@@ -144,30 +145,32 @@ def why_stopped(s: Snapshot, stopped_by: Notice) -> Notice:
     """Return the reason that keeps the robot in STOPPED, to which ``stopped_by`` led."""
     inputs = s.inputs
     if inputs.estop_button:
-        text = "emergency stop button is pressed: release it, then release the stop here"
+        text = "The robot's emergency stop button is pressed. Release it, then release the stop here."
         return Notice(Reason.ESTOP_BUTTON, text)
     if inputs.estop:
-        return Notice(Reason.ESTOP, inputs.estop_why or "emergency stop: release it to continue")
+        return Notice(Reason.ESTOP, inputs.estop_why or "Emergency stop is pressed. Release it to continue.")
     if s.stale_in_real:
-        return stale_notice(s.stale_in_real).prefixed("stopped: ")
+        return stale_notice(s.stale_in_real)
     if inputs.robot_pose is None:
-        return Notice(Reason.POSE_UNKNOWN, "stopped: the robot's pose in the map is not known")
+        return POSE_UNKNOWN
     if images_too_rare(inputs, s.config):
         longest_s = s.config.timeouts.slowest_image_s
-        text = f"stopped: waiting for a camera image every {longest_s:g} s or more often"
+        text = (
+            f"The robot waits for a camera image every {longest_s:g} s or more often. Check the camera if this lasts."
+        )
         return Notice(Reason.IMAGES_TOO_RARE, text)
     if s.command != NO_MOTION or inputs.held_in_vain:
-        return Notice(Reason.RELEASE_CONTROLS, f"let go of the controls to continue (stopped: {stopped_by.text})")
-    return stopped_by.prefixed("stopped: ")
+        return Notice(Reason.RELEASE_CONTROLS, f"{stopped_by.text} Let go of the controls to continue.")
+    return stopped_by
 
 
 def _far_from_keyframe(s: Snapshot) -> str:
     """Return the text for a v-bot outside the region that the virtual space shows well; "" inside."""
     expected_db = s.inputs.vspace.expected_psnr_db
     if 0.0 < expected_db < s.config.switch.min_expected_psnr_db:
-        return f"; most of the view is guessed here ({expected_db:.0f} dB expected)"
+        return f" Most of the view is guessed here ({expected_db:.0f} dB expected)."
     vspace = s.last_ready_vspace
     away_m = 0.0 if vspace is None else float(np.linalg.norm(s.vbot_pose[:2] - vspace.position))
     if vspace is None or away_m <= vspace.ready_radius_m:
         return ""
-    return f"; the view gets worse {away_m:.1f} m from its keyframe"
+    return f" The view gets worse: its keyframe is {away_m:.1f} m away."

@@ -12,7 +12,7 @@ from instant_ic.util.diagnosis import Diagnosis, Level
 FUTURE_NS = 500_000_000
 """A release stamped farther ahead than this was published before the clock was set back."""
 OLD_NS = 3_000_000_000
-"""An older message is a latched value that comes again, as after a restart of a bridge: nobody acts now."""
+"""An older message is a latched value that is repeated, as after a restart of a bridge: no new action."""
 
 
 @dataclass
@@ -26,7 +26,7 @@ class EstopLatch:
         pressed: a press has not been released yet.
         publisher: name of the node that pressed last.
         pressed_ns: publication time of that press, nanoseconds since the epoch.
-        again: the press was a latched value that came again; then such a release, if it is newer, ends it.
+        again: the press was a repeated latched value; a newer repeated release then ends it.
         buttons: names of the nodes that report a pressed button on the robot.
     """
 
@@ -78,7 +78,7 @@ class EstopLatch:
             cause = "the button on the robot is pressed, or its motor controller reports a fault"
             return f"{cause}. Release the button or remove the fault, then release the stop again."
         advice = "If a clock was set, press stop and release again."
-        again = old and self.again  # both were judged before this node started
+        again = old and self.again  # press and release were both judged before this node started
         if holder is not None and not again and (why := may_release_estop(publisher, holder)):
             return why
         if publish_ns > received_ns + FUTURE_NS:
@@ -120,7 +120,7 @@ class KeptEstop(EstopLatch):
         self._run_dir = run_dir
         self._kept = None if run_dir is None else estop_state.read(run_dir)
         if self._kept is not None:
-            # Only a release from here on counts. The clock may have been set: an old one may look newer than the press.
+            # Only releases from now on count: if the clock was set, an old one may look newer than the press.
             self._kept = replace(self._kept, pressed_ns=now_ns)
             self.hear(True, self._kept.publisher, self._kept.pressed_ns, now_ns)
 
@@ -132,7 +132,7 @@ class KeptEstop(EstopLatch):
         """Save a press, or delete a released one; the disk may be slow.
 
         Returns:
-            Whether it could be written; None if nothing had to be.
+            Result of writing the file; None if there was nothing to write.
         """
         before, now = self._kept, estop_state.KeptStop(self.publisher, self.pressed_ns) if self.pressed else None
         same = before is not None and now is not None and before.pressed_ns == now.pressed_ns

@@ -22,19 +22,19 @@ from instant_ic.geometry.motion import along_arc
 from instant_ic.geometry.poses import relative2, wrap_angle
 
 LOOKAHEAD_TIME_S = 1.0
-"""Distance of the carrot in seconds at the present speed."""
+"""Distance of the carrot, in seconds at the present speed."""
 SCALING_MIN_RADIUS_M, SCALING_MIN_SPEED_M_S = 0.60, 0.05
 """The robot is slower in curves tighter than the radius, but not slower than the speed."""
 ROTATE_MIN_RAD, ROTATE_STOP_RAD = 0.8, 0.15
 """Bearings of the carrot above which the robot turns on the spot, and below which it drives on."""
 ROTATE_GAIN = 2.0
-"""1/s."""
+"""Turn rate per radian of bearing, 1/s."""
 APPROACH_DECEL_M_S2 = 0.4
-"""Braking towards the end of the path."""
+"""Deceleration before the end of the path."""
 CHECKED_S = 1.0
 """Seconds of the arc to the carrot that are checked for collisions."""
 PADDING_M = 0.01
-"""Round the footprint in this check."""
+"""Padding of the footprint in this check."""
 GOAL_M, GOAL_RAD = 0.05, 0.05
 """Tolerance at the goal: well inside ``switch.position_m`` and ``switch.yaw_deg``."""
 TRACK_DISTANCE_M = 0.6
@@ -44,7 +44,7 @@ BESIDE_M = 0.3
 STANDS_BELOW = 0.05
 """m/s or rad/s; below this speed the v-bot counts as standing."""
 TRACK_GAIN_X, TRACK_GAIN_Y, TRACK_GAIN_YAW = 1.5, 6.0, 3.0
-"""Along the heading (1/s), across (1/m²), of the heading (1/m)."""
+"""Gains along the heading (1/s), across it (1/m²), and of the heading error (1/m)."""
 CARROT_SHARES = (1.0, 0.7, 0.45, 0.25)
 """Shares of the lookahead that are tried in turn while the arc to the carrot would touch something."""
 
@@ -119,8 +119,8 @@ class PathFollower:
         distance = math.hypot(ahead, left)
         moving = plan.reached and max(abs(goal_velocity[0]), abs(goal_velocity[1])) > STANDS_BELOW
         near = distance < TRACK_DISTANCE_M and abs(turn) < 1.0
-        # Tracking drives straight at the goal: only where the path does so too, not round a corner. A path to a goal
-        # that is very near but not ahead is a manoeuvre, which is not worth it for a moving goal.
+        # Tracking drives straight to the goal, so the path must be straight too. A very near goal beside the robot is
+        # also tracked: a manoeuvre is not worth it for a moving goal.
         if (
             moving
             and near
@@ -144,7 +144,7 @@ class PathFollower:
         """Apply the tracking law of Kanayama et al. (1990): the goal's own twist plus the error at the robot."""
         linear, angular = goal_velocity
         v = linear * math.cos(turn) + TRACK_GAIN_X * ahead
-        # The law is for forward motion: backwards, the term of the heading would turn the robot away.
+        # abs: the law is for forward motion. Backwards, the heading term would turn the robot away.
         w = angular + linear * TRACK_GAIN_Y * left + abs(linear) * TRACK_GAIN_YAW * math.sin(turn)
         most = self.config.desired_linear_vel
         return self.limits.clip(min(max(v, -most), most), w)

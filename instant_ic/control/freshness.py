@@ -11,14 +11,14 @@ from typing import Annotated, TypeAlias
 from instant_ic.config.ranges import Checked, Plausible
 
 _Timeout: TypeAlias = Annotated[float, Plausible(0.05, 2)]
-"""Beyond 2 s it is no time-out: a robot must not drive on such old data or commands."""
+"""At most 2 s: the robot must not drive on older data or commands."""
 _ImageTimeout: TypeAlias = Annotated[float, Plausible(0.05, 10)]
-"""Images may be rare where the robot is slow: ``image_travel_m`` bounds its way."""
+"""Images may be rarer: the robot then drives slower (``image_travel_m``)."""
 
 IMAGES = ("camera", "view")
 """Sources that show the operator the robot's place."""
 _LATE_SHARE = 0.25
-"""Rare images vary by more than ``late_s``: by this share of their period."""
+"""Rare images arrive late by up to this share of their period, which may exceed ``late_s``."""
 _UNKNOWN_PERIOD_S = 0.5
 """Period assumed for images until their rate is known."""
 
@@ -83,7 +83,7 @@ class TimeoutConfig(Checked):
     def lost_s(self, key: str, usual_s: float | None = None) -> float:
         """Return the seconds of silence after which source ``key`` counts as lost: the machine goes to STOPPED.
 
-        One missing image is no loss at any image rate.
+        A single missing image is never a loss.
         """
         return max(
             self.stop_after_s, 2.0 * self.allowed_s(key, usual_s) if key in IMAGES else self.allowed_s(key, usual_s)
@@ -93,8 +93,8 @@ class TimeoutConfig(Checked):
 class Rhythm:
     """Usual age of a source when its next message arrives: its period, plus its delay where age counts from the stamp.
 
-    The median of the last messages; inf until ``_NEEDED`` have arrived. Where the newest ones come more slowly, their
-    median counts: after two late images the robot drives slower, instead of stopping at each of the next ten.
+    It is the median of the last messages, or of the newest ones if that is longer: after two late images the robot
+    drives slower, instead of stopping at each of the next ten. It is inf until ``_NEEDED`` messages have arrived.
     """
 
     _NEEDED, _KEPT, _NEWEST = 5, 20, 3

@@ -19,8 +19,11 @@ MIN_SWITCH_SPEED_M_S = 0.03
 RETURN_SIDE_M = 0.12
 """Width beside the footprint, on each side, that must be free for a return."""
 _SILENT_S = 1.0
-"""Hands are off after such a time of silence: a link that pauses says nothing about a held key. Silence after a held
-key shows nothing."""
+"""Seconds of silence after which the controls count as released, if none was held before: a link that pauses reports no
+release of a held key."""
+
+POSE_UNKNOWN = Notice(Reason.POSE_UNKNOWN, "The robot's pose in the map is not known. Wait for the SLAM.")
+NO_COSTMAP = Notice(Reason.NO_COSTMAP, "There is no costmap yet. Wait for a LiDAR scan.")
 
 
 def estop_pressed(s: Snapshot) -> bool:
@@ -63,14 +66,14 @@ def no_view_in_time(s: Snapshot) -> bool:
 def way_free(s: Snapshot) -> bool:
     """Return whether the way that triggers an entry is free, and also a longer and wider one.
 
-    Thus the conditions for entry and return never hold together.
+    So the conditions of entry and return never hold together.
     """
     inputs, switch, command = s.inputs, s.config.switch, s.command
     if inputs.robot_pose is None or inputs.costmap is None:
         return False
     if command == NO_MOTION and s.idle_s < switch.neutral_return_s:
-        # Hands off before the obstacle: the next command is most likely the last one again. The real view returns
-        # only after a while.
+        # The operator has let go before the obstacle, and most likely repeats the last command. So the real view
+        # returns only after a while.
         command = s.last_command
     return all(
         s.predictor.predict(
@@ -84,7 +87,7 @@ def way_free(s: Snapshot) -> bool:
 def view_fits(s: Snapshot) -> bool:
     switch = s.config.switch
     vbot_placed = s.inputs.age("vbot") < s.in_mode_s
-    # Without an operator nobody drives the v-bot that the r-bot would follow.
+    # Without fresh commands nobody would drive the v-bot that the r-bot follows.
     return (
         vbot_placed
         and s.fresh
@@ -114,7 +117,7 @@ def image_fits(s: Snapshot) -> bool:
     if waited >= 2.0:
         return True  # the pose jitters by more than the thresholds; the page eases the rest
     within_m, within_deg = switch.return_picture_m, switch.return_picture_yaw_deg
-    # In two consecutive steps: SLAM's heading jitters, and the pose shown before counts too.
+    # Both of the last steps must agree: SLAM's heading jitters, and the page may still show the one before.
     yaw_gap = max(abs(s.yaw_gap_rad), abs(s.yaw_gap_before_rad))
     if s.gap_m > within_m or yaw_gap > math.radians(within_deg):
         return False
@@ -143,13 +146,13 @@ GUARD_FUNCTIONS: dict[str, Callable[[Snapshot], bool]] = {name: globals()[name] 
 def hold(s: Snapshot) -> Notice | None:
     """Return the reason why nothing may move in this state; None when it may."""
     if s.settles:
-        return Notice(Reason.INTERRUPTED, "stopped: the robot's control stood still for a moment")
+        return Notice(Reason.INTERRUPTED, "The robot's control stood still for a moment. The robot has stopped.")
     if s.stale:
-        return stale_notice(s.stale).prefixed("stopped: ")
+        return stale_notice(s.stale)
     if s.inputs.robot_pose is None:
-        return Notice(Reason.POSE_UNKNOWN, "the robot's pose in the map is not known")
+        return POSE_UNKNOWN
     if s.inputs.costmap is None:
-        return Notice(Reason.NO_COSTMAP, "there is no costmap yet")
+        return NO_COSTMAP
     return None
 
 
@@ -173,59 +176,61 @@ def images_agree(s: Snapshot, within_m: float, within_deg: float) -> bool:
 
 
 def against_switch(s: Snapshot) -> Notice | None:
-    """Return the reason against a switch with an obstacle ahead, except that there is no way round it."""
+    """Return the reason against a switch with an obstacle ahead; ``passage`` checks the way round it."""
     inputs, switch, vspace = s.inputs, s.config.switch, s.vspace
     assert inputs.robot_pose is not None
     if s.pose_doubtful:
-        return Notice(Reason.POSE_DOUBTFUL, "the robot is not sure of its place")
+        return Notice(Reason.POSE_DOUBTFUL, "The robot is not sure of its place. Drive slowly until it is recognized.")
     if s.inputs.contradiction:
         return Notice(Reason.CONTRADICTION, s.inputs.contradiction.text)
     if abs(s.command[0]) < MIN_SWITCH_SPEED_M_S:
-        return Notice(Reason.NO_ROOM_TO_TURN, "there is no room to turn")
+        return Notice(Reason.NO_ROOM_TO_TURN, "There is no room to turn. Drive straight first.")
     if inputs.age("vspace") > s.config.timeouts.vspace:
-        return Notice(Reason.VSPACE_NOT_RUNNING, "no virtual space is running")
+        return Notice(Reason.VSPACE_NOT_RUNNING, "No virtual space is running. Drive round the obstacle.")
     if not vspace.ready:
         why = f" ({vspace.message})" if vspace.message else ""
-        return Notice(Reason.VSPACE_NOT_READY, "the virtual space is not ready" + why)
+        return Notice(
+            Reason.VSPACE_NOT_READY, f"The virtual space is not ready{why}. Wait, or drive round the obstacle."
+        )
     away_m = float(np.linalg.norm(vspace.position - inputs.robot_pose[:2]))
     if away_m > vspace.ready_radius_m:
         return Notice(
             Reason.VSPACE_TOO_FAR,
-            f"the virtual space is valid within {vspace.ready_radius_m:.1f} m of its keyframe, "
-            f"which is {away_m:.1f} m away",
+            f"The virtual space is valid within {vspace.ready_radius_m:.1f} m of its keyframe, "
+            f"which is {away_m:.1f} m away. Wait for the next keyframe.",
         )
     if 0.0 < vspace.expected_psnr_db < switch.min_expected_psnr_db:  # NaN means unknown
         return Notice(
             Reason.VSPACE_TOO_POOR,
-            f"the virtual space shows this place too poorly ({vspace.expected_psnr_db:.0f} dB expected, "
-            f"{switch.min_expected_psnr_db:.0f} dB needed)",
+            f"The virtual space shows this place too poorly ({vspace.expected_psnr_db:.0f} dB expected, "
+            f"{switch.min_expected_psnr_db:.0f} dB needed). Wait for the next keyframe.",
         )
     if s.no_view_fits:
-        text = "no view of the virtual space fits here; let go, then drive on to try again"
+        text = "No view of the virtual space fits here. Let go of the controls, then drive on to try again."
         return Notice(Reason.NO_VIEW_FITS, text)
     if s.since_return_s < switch.min_real_s:
-        return Notice(Reason.JUST_RETURNED, "just back from the virtual space")
+        return Notice(Reason.JUST_RETURNED, "The virtual space has just been left. Wait a moment.")
     if inputs.costmap is None:
-        return Notice(Reason.NO_COSTMAP, "there is no costmap yet")
+        return NO_COSTMAP
     return None
 
 
 def stop_notice(s: Snapshot) -> Notice:
     """Return the reason of a transition to STOPPED."""
     if estop_pressed(s):
-        return Notice(Reason.ESTOP, "emergency stop")
+        return Notice(Reason.ESTOP, "The emergency stop was pressed.")
     if s.interrupted is not None:
         return s.interrupted
     if s.lost:
         return stale_notice(s.lost)
     if s.pose_lost:
-        return Notice(Reason.POSE_LOST, "the robot has lost its place")
+        return Notice(Reason.POSE_LOST, "The robot has lost its place on the map.")
     if s.pose_jumped:
-        return Notice(Reason.POSE_LOST, "the robot's place on the map has jumped; check where it stands")
+        return Notice(Reason.POSE_LOST, "The robot's place on the map has jumped. Check where it stands.")
     if s.contradicted:
         return Notice(Reason.CONTRADICTION, s.inputs.contradiction.text)
     if s.vbot_jumped:
-        return Notice(Reason.VBOT_STALE, "the v-bot's place on the map has jumped")
+        return Notice(Reason.VBOT_STALE, "The virtual robot's place on the map has jumped.")
     if s.inputs.vspace.failed:
-        return Notice(Reason.VSPACE_FAILED, f"the virtual space failed: {s.inputs.vspace.message}")
-    return Notice(Reason.VSPACE_LOST, "the virtual space is silent")
+        return Notice(Reason.VSPACE_FAILED, f"The virtual space has failed ({s.inputs.vspace.message}).")
+    return Notice(Reason.VSPACE_LOST, "The virtual space has stopped reporting.")

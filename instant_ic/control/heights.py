@@ -36,10 +36,10 @@ INSIDE_WEIGHT, MOST_EVIDENCE = 4, 200
 FAST = {"contract", "arcp", "afn"}
 """Fast-math flags that keep nan and inf."""
 UNSEEN_EDGE_M, FAR_BEHIND_M = 0.1, 0.4
-"""Distances before and behind the point where only the lowest ring meets a thing, from above: the thing may begin that
-far before it, and the next ring ends at least that far behind it."""
+"""A thing that only the lowest ring meets, from above, may begin the first distance before that point, if the next ring
+ends the second distance behind it."""
 SCATTER_M = 0.01
-"""Metres by which the heights of points on one surface differ: noise of the ranges, pitch of the robot."""
+"""Scatter of the heights of one surface, in metres: noise of the ranges, pitch of the robot."""
 INSTANTS = 65
 """Sensor poses per sweep: accurate to 1 mrad at 1 rad/s."""
 
@@ -160,7 +160,7 @@ class HeightLayer:
 
     def carry(self, cells: NDArray[np.intp], goals: NDArray[np.intp]) -> None:
         """Move marks from ``cells`` to ``goals``, rows and columns (2, N); all others are forgotten."""
-        order = np.argsort(self.hits[cells[0], cells[1]])  # of two in one cell, the one with more points stays
+        order = np.argsort(self.hits[cells[0], cells[1]])  # of two marks in one cell, the one with more points stays
         (rows, columns), (to_rows, to_columns) = cells[:, order], goals[:, order]
         for layer in (self.hits, self.low, self.high, self.evidence):
             kept = layer[rows, columns]

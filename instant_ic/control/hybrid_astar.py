@@ -319,7 +319,7 @@ def search(
             other = (heading + TURNS[k]) % bins
             weight = grid.weights[r, c]
             if closed[other, r, c] or (weight == 0.0 and nodes.overlap[node] == 0 and grid.costs[row, column] < 253):
-                continue  # out of closed cells, never into them
+                continue  # the robot may leave closed cells, never enter them
             weight = weight if weight != 0.0 else np.float32(rules.closed_weight)
             new = nodes.price[node] + _step_price(k, weight, nodes.drive[node], per_bin, rules)
             if new >= best[other, r, c] - 1e-4:
@@ -420,7 +420,7 @@ def _touching(
     heading, before = nodes.heading[node], nodes.overlap[node]
     touching = _overlap(grid.costs, grid.clearance, x, y, grid.bodies[(heading + TURNS[k]) % bins])
     if touching > 0:
-        # Only for a robot that already stands on an obstacle, and only to leave it.
+        # Contact is allowed only to a robot that stands on an obstacle already, so that it can leave.
         near = math.hypot(x - start.x, y - start.y) <= escape
         return -1 if before == 0 or touching > before or not near else touching
     if LENGTHS[k] != 0.0 and before == 0:

@@ -14,7 +14,7 @@ WATCHED = {"odometry": "base driver", "nav": "navigator", "vbot": "virtual robot
 
 
 class Interruptions:
-    """Looks for what ends the operator's right to drive on under a held key: a long gap, a suspended or new process."""
+    """Detector of events after which a held key must not drive on: a long gap, a suspended machine, a new process."""
 
     def __init__(self) -> None:
         self.gap = StepGap()
@@ -33,10 +33,10 @@ class Interruptions:
         new = [key for key, instance in instances.items() if self._instances.get(key, instance) != instance]
         self._instances |= instances
         if math.isinf(self.gap_s):
-            return Notice(Reason.INTERRUPTED, "this computer was suspended")
+            return Notice(Reason.INTERRUPTED, "This computer was suspended.")
         if self.gap_s > longest_s:
-            return Notice(Reason.INTERRUPTED, f"the robot's control stood still for {self.gap_s:.1f} s")
+            return Notice(Reason.INTERRUPTED, f"The robot's control stood still for {self.gap_s:.1f} s.")
         if new:
-            names = ", ".join(sorted({f"the {WATCHED[key]} ({publisher})" for key, publisher in new}))
-            return Notice(Reason.INTERRUPTED, f"{names} was restarted")
+            names = ", ".join(sorted({f"{WATCHED[key]} ({publisher})" for key, publisher in new}))
+            return Notice(Reason.INTERRUPTED, f"The {names} was restarted.")
         return None

@@ -1,8 +1,8 @@
-"""People and other moving things: points with a velocity, from where a scan hits what was free half a second ago.
+"""People and other moving things, as points with a velocity.
 
-A tall thing counts as moving when its points lie in space through which the LiDAR has looked shortly before, and it
-keeps moving as one body. Nothing is recognised by its shape but its height: low and hanging things come into view and
-vanish as the robot drives, so their edges seem to move.
+A tall thing counts as moving when its points lie in space that the LiDAR saw free shortly before, and it keeps moving
+as one body. Its shape does not matter, only its height: low and hanging things come into view and vanish as the robot
+drives, so their edges seem to move.
 """
 
 from __future__ import annotations
@@ -17,19 +17,19 @@ from numpy.typing import NDArray
 from instant_ic.control.heights import AZIMUTHS, SortedPoints
 
 MOST_SPEED_M_S = 2.0
-"""Nobody in a building walks faster."""
+"""Highest speed of a person in a building."""
 _LEAST_SPEED_M_S = 0.2
 _RANGE_M = 4.0
 _COMPARED_S = (0.3, 0.8)
-"""Ages of the sweep with which a new one is compared."""
+"""Ages of the sweeps with which a new one is compared, in seconds."""
 _KEPT_S = 0.8
-"""A body that is no longer seen (nearer than the LiDAR's blind zone) moves on for this long."""
+"""Time for which a body that is no longer seen (in the LiDAR's blind zone) is moved on."""
 _MARGIN_M = 0.15
 _BODY_M = 0.35
-"""Points nearer than this to a body's middle belong to it."""
+"""Points nearer than this to a body's centre belong to it."""
 _LEAST_POINTS = 3
 _TALL_ROWS = 6
-"""Elevations at which a body must be hit."""
+"""Smallest number of elevations at which a body is hit."""
 
 
 @dataclass(frozen=True)
@@ -45,14 +45,14 @@ NOTHING_MOVES = MovingPoints(np.zeros((0, 2)), np.zeros((0, 2)))
 
 @dataclass(frozen=True)
 class _Look:
-    """One sweep seen flat: the nearest tall or low thing in each direction."""
+    """The nearest thing in each direction of one sweep, seen flat."""
 
     time_s: float
     origin: NDArray[np.float64]
     ranges: NDArray[np.float64]
     """(AZIMUTHS,) metres; inf where nothing stands."""
     tall: NDArray[np.bool_]
-    """(AZIMUTHS,) hit at enough elevations at this range."""
+    """(AZIMUTHS,) whether enough elevations are hit at this range."""
 
     def points(self) -> NDArray[np.float64]:
         """Return the tall things within ``_RANGE_M``, by azimuth, (M, 2)."""
@@ -61,7 +61,7 @@ class _Look:
         return self.origin + self.ranges[index, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
 
     def free_at(self, points: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Return whether every beam of this sweep near points (M, 2) went well past them."""
+        """Return for each point (M, 2) whether all beams beside it went well past it, (M,)."""
         away = points - self.origin
         column = np.floor((np.arctan2(away[:, 1], away[:, 0]) + math.pi) * (AZIMUTHS / (2 * math.pi))).astype(np.int64)
         around = self.ranges[(column[:, None] + np.arange(-2, 3)) % AZIMUTHS].min(axis=1)
@@ -73,11 +73,11 @@ class _Look:
 class _MovingBody:
     points: NDArray[np.float64]
     places: deque[tuple[float, NDArray[np.float64]]] = field(default_factory=lambda: deque(maxlen=8))
-    """Times and middles (2,), newest last."""
+    """Times and centres (2,), newest last."""
 
     @property
     def velocity(self) -> NDArray[np.float64]:
-        """Metres per second (2,) over the last half second; zero while not known."""
+        """Velocity over the last half second in m/s, (2,); zero while unknown."""
         (end_s, end), (start_s, start) = self.places[-1], self.places[0]
         for time_s, place in self.places:
             if end_s - time_s <= 0.6:
@@ -87,11 +87,11 @@ class _MovingBody:
 
     @property
     def stands(self) -> bool:
-        """True if it has not moved on since it was found: a thing, or a person who has stopped."""
+        """True if it has not moved since it was found: a thing, or a person who has stopped."""
         return len(self.places) >= 6 and float(np.hypot(*self.velocity)) < 0.5 * _LEAST_SPEED_M_S
 
     def at(self, time_s: float) -> NDArray[np.float64]:
-        """Return the middle (2,) expected at a time."""
+        """Return the centre (2,) expected at a time."""
         return self.places[-1][1] + self.velocity * (time_s - self.places[-1][0])
 
 
@@ -103,7 +103,7 @@ class MovingThings:
         self._bodies: list[_MovingBody] = []
 
     def update(self, sweep: SortedPoints, time_s: float) -> None:
-        """Add a sweep of 3D points, measured at ``time_s`` (seconds, steady); earlier ones restart the tracks."""
+        """Add a sweep of 3D points, measured at ``time_s`` (seconds, steady); an earlier time restarts the tracks."""
         if self._looks and not 0.0 <= time_s - self._looks[-1].time_s <= _COMPARED_S[1]:
             self._looks.clear()
             self._bodies = []
@@ -126,7 +126,7 @@ class MovingThings:
             self._bodies.append(_MovingBody(body, deque([(time_s, _middle(body))], maxlen=8)))
 
     def _follow(self, body: _MovingBody, points: NDArray[np.float64], time_s: float) -> NDArray[np.bool_]:
-        """Move a body on to its points (mask (M,)) in the newest sweep."""
+        """Update a body from the newest sweep; return the mask (M,) of its points."""
         mine: NDArray[np.bool_] = np.linalg.norm(points - body.at(time_s), axis=1) < _BODY_M
         if mine.sum() >= _LEAST_POINTS:
             body.points = points[mine]
@@ -157,7 +157,7 @@ def _look(sweep: SortedPoints, time_s: float) -> _Look:
 
 
 def _middle(points: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the middle (2,) of the box round points."""
+    """Return the centre (2,) of the box round points."""
     middle: NDArray[np.float64] = 0.5 * (points.min(axis=0) + points.max(axis=0))
     return middle
 

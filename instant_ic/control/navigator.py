@@ -21,11 +21,11 @@ _STUCK_AFTER_NS = 1_500_000_000
 _RECOVERY_NS = 1_500_000_000
 """Duration of backing off."""
 _RECOVERY_M_S = 0.15
-"""Backwards, the next time forwards."""
+"""Speed of backing off: first backwards, the next time forwards."""
 _MOVED_M, _TURNED_RAD = 0.03, 0.05
-"""From one of these on the robot counts as moving."""
+"""The robot counts as moving when it exceeds either limit."""
 _GIVE_UP_AFTER_S = 8.0
-"""Time without a shorter way to a standing goal, after which the robot stands and says that there is no way."""
+"""Time without a shorter way to a standing goal, after which the robot stands and reports that there is no way."""
 _KEEP_PLAN_NS = 3_000_000_000
 """Time for which a path to the goal that is still free is kept when no new one is found."""
 _NO_PLAN = no_plan("no plan yet")
@@ -70,7 +70,7 @@ class Navigator:
         self._plan = _NO_PLAN
         self._planned_ns: int | None = None
         self._found_ns: int | None = None  # when a path all the way to the goal was last planned
-        self._moved_ns: int | None = None  # when the robot last moved, or was not commanded to
+        self._moved_ns: int | None = None  # when the robot last moved, or had no command to move
         self._moved_pose: NDArray[np.float64] = np.zeros(3)
         self._recovering_ns: int | None = None
         self._direction = -1.0
@@ -142,7 +142,7 @@ class Navigator:
 
 
 _MOST_AHEAD_M = 0.2
-"""Largest lead: a camera that is later than this at full speed is not compensated fully."""
+"""Largest distance for which a late camera is compensated."""
 
 
 def meeting_pose(

@@ -17,10 +17,10 @@ _MOST_SENDERS = 64
 class OperatorCommands:
     """Follows the commands from step to step.
 
-    A control that was held in vain, or when its commands ended, must be released first, by its sender whenever it comes
-    back; in the second case also by the next operator. Commands end if none is fresh for too long, or if their sender
-    has given up the lease or was started again. This needs a sender that sends zeros while its operator commands
-    nothing, as the console does. The silence of any other sender may be its release.
+    A control that was held while its commands were refused, or when they ended, must be released before it drives
+    again. This binds its sender whenever it comes back; if commands ended, it binds the next operator too. Commands end
+    when none is fresh for too long, or when their sender gives up the lease or restarts. Only senders that send zeros
+    while their operator commands nothing, as the console does, are held to this: silence of another may be a release.
 
     Attributes:
         command: m/s, rad/s, within the limits; zero when stale.
@@ -37,7 +37,7 @@ class OperatorCommands:
         self._driven_ns: int | None = None  # time of the last motion
         self._let_go_ns: int | None = None  # start of the present sender's zeros
         self._holder = ""  # in the previous step
-        # Senders who held a control in vain, or when their commands ended; whether they are known to send zeros.
+        # Senders that must release a control first, and whether they are known to send zeros.
         self._must_release: dict[str, bool] = {}
         self._ended = False  # held commands ended, and nobody has let go since
 
@@ -66,7 +66,7 @@ class OperatorCommands:
             self.last, self._driven_ns, self._let_go_ns = self.command, now_ns, None
             self.held_by = holder if inputs.holder_sends_zeros or self._must_release.get(holder) else ""
             ended = self.held_by and (self._ended or holder in self._must_release)
-            return Notice(Reason.OPERATOR_LOST, "the operator's link was lost") if ended else None
+            return Notice(Reason.OPERATOR_LOST, "The operator's link was lost.") if ended else None
         if not fresh:
             self._let_go_ns = None
         elif self._let_go_ns is None or holder != before:

@@ -54,16 +54,16 @@ def find_passage(
     if walls is not None:
         at_wall = np.flatnonzero(walls.distance(ahead[:exit_index, :2]) < WALL_CLEARANCE_M)
         if at_wall.size:
-            return Notice(Reason.WALL_AHEAD, "a wall is in the way")
+            return Notice(Reason.WALL_AHEAD, "A wall is in the way. Drive round it.")
     if exit_index == len(ahead):
-        text = f"no free space within {config.max_pass_m:.1f} m behind the obstacle"
+        text = f"There is no free space within {config.max_pass_m:.1f} m behind it. Drive another way."
         return Notice(Reason.NO_SPACE_BEHIND, text)
     goal = ahead[exit_index]
     start = prediction.poses[0]
     plan = planner.plan(costmap, start, goal)
     straight = float(np.linalg.norm(goal[:2] - start[:2]))
     if plan.whole_length_m > straight + config.max_detour_m:
-        text = f"there is no way round the obstacle ({_why(plan, straight, config)})"
+        text = f"There is no way round it ({_why(plan, straight, config)}). Drive another way."
         return Notice(Reason.NO_WAY_ROUND, text)
     return None
 

@@ -163,7 +163,7 @@ class HybridPlanner:
         reachable = bool(connected[near])
         target = goal
         if taken or outside or not reachable:
-            # Plan to the nearest reachable place instead; it is never one that was not seen.
+            # Plan to the nearest reachable place that has been seen.
             near = grid.nearest(connected, (row, column), near)
             place = costmap.centres(np.array(near[0]), np.array(near[1]))
             target = np.array([place[0], place[1], np.nan])

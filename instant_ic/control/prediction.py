@@ -20,7 +20,7 @@ _along_arc = njit(cache=True)(along_arc)
 _step_towards = njit(cache=True)(step_towards)
 
 _YAW_MARGIN_RAD = 0.4
-"""Margin in metres when turning on the spot, in place of ``margin_m``."""
+"""Margin when turning on the spot, in place of ``margin_m``."""
 _MAX_HORIZON_S = 8.0
 """Longest prediction, however slow the robot."""
 _STEP_S = 0.05

@@ -10,11 +10,11 @@ from numpy.typing import NDArray
 from instant_ic.control.planner import Plan
 
 _NEARER_M = 0.2
-"""Less than this is no progress: poses and paths are noisy."""
+"""Smallest approach that counts as progress; poses and paths are noisy."""
 _OTHER_WAY_M = 1.0
-"""A path longer by this is another way."""
+"""A path that is this much longer counts as another way."""
 _OTHER_WAYS = 2
-"""Number of longer ways that are tried to one goal before progress means: nearer than ever."""
+"""Longer ways that are tried to one goal; after them, only a new shortest way is progress."""
 _SAME_GOAL_M = 0.5
 _NO_WAY_M = 1000.0
 """A path that does not end at the goal counts as this much longer: a way to the goal is always progress."""
@@ -35,9 +35,9 @@ class Progress:
         self._given_up = 0
 
     def lost(self, plan: Plan, pose: NDArray[np.float64], goal: NDArray[np.float64], now_ns: int) -> bool:
-        """Take the newest plan from ``pose`` to ``goal`` (3,). True: nothing has come nearer for ``patience_s``.
+        """Note the newest plan from ``pose`` to ``goal`` (3,); return whether it makes no progress for ``patience_s``.
 
-        After that a way must be there without interruption, longer each time, before it is tried again.
+        After that, a way must stay open for some time, longer each time, before it is tried again.
         """
         if self._goal is None or math.dist(goal[:2], self._goal[:2]) > _SAME_GOAL_M:
             self.reset()

@@ -10,14 +10,10 @@ from instant_ic.control.states import Reason, Source
 
 
 class Notice(NamedTuple):
-    """A reason and its text for the operator, with the numbers of the moment."""
+    """A reason and its text for the operator: what has happened, then what to do, in whole sentences."""
 
     reason: Reason
     text: str
-
-    def prefixed(self, prefix: str) -> Notice:
-        """Return the same reason with text before it."""
-        return Notice(self.reason, prefix + self.text)
 
 
 class Stale(NamedTuple):
@@ -30,7 +26,7 @@ class Stale(NamedTuple):
 def stale_notice(stale: Sequence[Stale]) -> Notice:
     """Return a notice for stale sources, at least one: the code of the first, the text of all."""
     texts = [
-        source.text or (f"no {source.name} yet" if math.isinf(age_s) else f"no {source.name} for {age_s:.1f} s")
+        source.text or (f"No {source.name} yet." if math.isinf(age_s) else f"No {source.name} for {age_s:.1f} s.")
         for source, age_s in stale
     ]
-    return Notice(stale[0].source.reason, ", ".join(texts))
+    return Notice(stale[0].source.reason, " ".join([*texts, "The robot has stopped."]))

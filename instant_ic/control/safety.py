@@ -169,7 +169,7 @@ class CollisionMonitor:
             return MonitoredCommand(command, "free", math.inf)
         if not source_age_s <= self.config.source_timeout:
             return MonitoredCommand((0.0, 0.0), "stop", 0.0, "source_timeout")
-        # Both as if it moved as commanded already, and as it moves: a command to slow down or to turn away takes time.
+        # Check from the commanded twist and from the present one: to slow down or to turn away takes time.
         starts = {command, command if velocity is None else velocity}
         standing = MovingPoints(points, np.zeros_like(points))
         factor, action, decided, soonest = 1.0, "free", "", math.inf

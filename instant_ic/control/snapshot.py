@@ -45,9 +45,9 @@ class ArbiterInputs:
     robot_pose: NDArray[np.float64] | None = None
     """(3,) map_from_base of the r-bot; None while unknown."""
     pose_lost_probability: float = 0.0
-    """0..1, that the r-bot is somewhere else; 0 without a report."""
+    """Probability that the r-bot is somewhere else; 0 without a report."""
     contradiction: Contradiction = Contradiction.NONE
-    """Between wheels and LiDAR; until they have agreed again."""
+    """Contradiction between wheels and LiDAR, kept until they agree again."""
     contradictions: int = 0
     """Number of contradictions that the SLAM has reported."""
     robot_velocity: Twist2 = (0.0, 0.0)
@@ -55,13 +55,13 @@ class ArbiterInputs:
     holder: str = ""
     """Sender who has the robot's lease; empty: nobody."""
     holder_sends_zeros: bool = False
-    """It has sent zeros: its silence is no release."""
+    """True if this sender has sent zeros, so that its silence is no release."""
     refused: tuple[str, ...] = ()
     """Senders without the lease who hold a control."""
     operator_gone: bool = False
     """The client that sent the command has left since: the command is void, whatever its age."""
     held_in_vain: bool = False
-    """Nobody drives, because a client holds its controls since before it may."""
+    """True if nobody drives because a client must release its controls first."""
     estop: bool = False
     estop_button: bool = False
     """The button on the robot is pressed; only releasing it ends the stop."""
@@ -127,7 +127,7 @@ class Snapshot:
     stale: tuple[Stale, ...]
     """Stale sources that the present mode needs."""
     lost: tuple[Stale, ...]
-    """Those of them that are older than ``stop_after_s``: the robot must go to STOPPED."""
+    """Stale sources that have been silent for too long: the robot must go to STOPPED."""
     stale_in_real: tuple[Stale, ...]
     """Stale sources that REAL needs."""
     fresh_s: float
@@ -176,7 +176,7 @@ class Snapshot:
     """The v-bot returns to the r-bot by itself."""
     subgoal: Subgoal | None = None
     against_switch: Notice | None = None
-    """REAL with an obstacle ahead: reason against a switch; None: nothing speaks against it."""
+    """Reason against a switch in REAL with an obstacle ahead; None if there is none."""
 
     @property
     def pose_doubtful(self) -> bool:

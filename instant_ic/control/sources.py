@@ -12,7 +12,7 @@ from instant_ic.control.snapshot import ArbiterInputs
 from instant_ic.control.states import SOURCES, Mode, Source
 
 STEP_AFTER_S = 0.001
-"""Delay of a step after the time-out it checks: the source is then surely stale. Time-outs end that much sooner."""
+"""Delay of a step after the time-out that it checks, so that the source is stale; time-outs are shorter by as much."""
 _CATCH_UP = 0.8
 """Speed limit of the v-bot as a share of the r-bot's."""
 
@@ -35,7 +35,7 @@ class SourceMonitor:
             if source.optional and source.key not in inputs.ages:
                 continue
             age_s = _age_s(source, inputs, in_mode_s, shown_s)
-            # An age that is no number proves no freshness.
+            # In this form NaN is stale.
             fresh = age_s <= self._allowed_s(source, inputs)
             if not fresh or (source.key == "command" and inputs.operator_gone):
                 found.append(Stale(source, age_s))
@@ -56,7 +56,7 @@ class SourceMonitor:
             self._allowed_s(source, inputs) - _age_s(source, inputs, in_mode_s, shown_s) for source in _required(mode)
         ]
         left.append(self._command_s - inputs.age("command"))
-        # 0: not stale yet, but right after this step.
+        # 0 is not stale yet, but right after this step.
         return min((one for one in left if one >= 0.0), default=math.inf)
 
     def speed_limit_m_s(self, inputs: ArbiterInputs, mode: Mode) -> float:
@@ -79,8 +79,8 @@ class SourceMonitor:
             key=lambda source: self._allowed_s(source, inputs),
         )
         usual_s = inputs.usual.get(rare.key, math.inf)
-        every = f"one {rare.name} in {usual_s:.1f} s" if math.isfinite(usual_s) else f"{rare.name}s just began"
-        return f"; slowed to {limit:.2f} m/s: {every}"
+        every = f"one {rare.name} in {usual_s:.1f} s" if math.isfinite(usual_s) else f"the first {rare.name}s arrive"
+        return f" Slowed to {limit:.2f} m/s: {every}."
 
     def vbot_limit_m_s(self, inputs: ArbiterInputs, mode: Mode) -> float:
         """Return the speed limit of the v-bot; below full speed it is slow enough for the r-bot to catch up."""

@@ -180,7 +180,7 @@ class Source:
     """Code of the reason while it is stale."""
     modes: tuple[Mode, ...]
     text: str = ""
-    """Text for the operator while it is stale; empty: "no NAME for SECONDS"."""
+    """Text for the operator while it is stale; empty: "No NAME for SECONDS."."""
     optional: bool = False
     """Needed only after its first message: a robot without 3D points drives by its flat scan."""
     steady: bool = False
@@ -209,6 +209,6 @@ SOURCES: tuple[Source, ...] = (
         "operator's link",
         Reason.OPERATOR_LOST,
         (Mode.VIRTUAL,),
-        "the operator's link is lost, the robot waits",
+        "The operator's link is lost.",
     ),
 )

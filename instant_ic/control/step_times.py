@@ -13,7 +13,7 @@ class StepTimes:
 
     Attributes:
         obeyed: the operator's command of the last step.
-        shown: the last step is one to show: every second one is enough for display and planning.
+        shown: whether the last step is published for display and planning; every second one is enough.
     """
 
     def __init__(self) -> None:
@@ -27,7 +27,7 @@ class StepTimes:
         """Return whether this timer steps."""
         self._early = False
         since_s = (now_ns - self._stepped_ns) / 1e9
-        # Timers jitter: at 20 Hz every second one is meant.
+        # 0.9: timers jitter, and at 20 Hz every second one must step.
         return not 0.0 <= since_s < 0.9 * REST_STEP_S or not rests
 
     def command_steps(self, command: tuple[float, float]) -> bool:
@@ -45,7 +45,7 @@ class StepTimes:
         return True
 
     def begin_step(self, now_ns: int, rests: bool) -> bool:
-        """Note a step; returns whether a rest ends with it."""
+        """Note a step; return whether it ends a rest."""
         before, self._rests, self._stepped_ns = self._rests, rests, now_ns
         self.shown = not self.shown
         return before and not rests

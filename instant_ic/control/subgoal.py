@@ -18,7 +18,7 @@ MAX_COST = 150
 WALL_CLEARANCE_M = 0.25
 """A search straight on ends where the line comes nearer to a wall than this."""
 _SEARCH_RADIUS_M = 1.5
-"""Round the v-bot; searched when nothing is free straight on."""
+"""Radius of the search round the v-bot when nothing is free straight on."""
 
 
 @dataclass(frozen=True)

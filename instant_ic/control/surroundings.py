@@ -24,10 +24,10 @@ log = logging.getLogger(__name__)
 _MOTION_SAMPLES = 9
 """Poses of the sensor over a sweep of points; between them its motion counts as even."""
 _CORRECTED_M, _CORRECTED_RAD = 0.05, math.radians(2.0)
-"""Motion of the robot in the map beyond that of odometry, between two updates, above which the map was corrected. The
-costmap's marks then move with the robot, since from near no sensor may see them again. Less is slip of the tracks."""
+"""The map counts as corrected when the robot moves this much more in it than by odometry between two updates. The
+costmap's marks then move with the robot, since no sensor may see them again from near. Less is slip of the tracks."""
 _JUMP_M, _JUMP_RAD = 0.5, 0.5
-"""The same, above which the robot was carried off: the costmap forgets its marks. The arbiter stops the robot before
+"""Above this the robot counts as carried off: the costmap forgets its marks. The arbiter has stopped the robot by then
 (``pose_trust``)."""
 
 
@@ -71,7 +71,7 @@ class ArrivedCloud:
 
 
 _BLIND_RAD, _LANE_M = math.radians(10.0), 1.0
-"""Width of a run of beams without a measurement that makes blind, and length of the lane that must be seen."""
+"""Width of a run of missing beams that counts as covered, and length of the lanes that must be seen."""
 
 
 class Surroundings:
@@ -87,7 +87,7 @@ class Surroundings:
         self.blind = (False, False)
         """LiDAR covered ahead, and behind: it measures nothing in a sector where it did before."""
         self.findings: dict[str, Diagnosis] = {}
-        """By input: scan, points, costmap, pose."""
+        """Diagnoses by input: scan, points, costmap, pose."""
         if not config.points.enabled:
             self._find("points", True, "not used (costmap.points.enabled is false)")
         else:
@@ -192,7 +192,7 @@ class Surroundings:
 
     def publish_due(self, steady_ns: int) -> bool:
         """Return whether the costmap is to be published now, by ``publish_frequency``; it then counts as published."""
-        # A little early counts: updates come at the scan's rate, not at the publish frequency.
+        # 0.9: updates come at the scan's rate, not at the publish frequency.
         due_ns = 0.9e9 / self.config.publish_frequency
         sent_ns = self._published_ns  # later than now if the clock went back: a bag player restarted
         if sent_ns is not None and 0 <= steady_ns - sent_ns < due_ns:
@@ -205,8 +205,8 @@ class Surroundings:
         before, self._map_from_odom = self._map_from_odom, map_from_odom
         if before is None:
             return
-        # Compared once per costmap period, which is shorter than SLAM's: a correction arrives in one piece. Compared at
-        # the robot: far from the origin of odom, a turn by a degree moves that origin by decimetres.
+        # The costmap's period is shorter than SLAM's, so a correction arrives in one piece. Compare at the robot: far
+        # from the origin of odom, a turn by a degree moves that origin by decimetres.
         odom_from_base = self._tf.lookup("odom", "base_link")
         x, y, yaw = relative2(
             pose2_from_matrix(before @ odom_from_base), pose2_from_matrix(map_from_odom @ odom_from_base)

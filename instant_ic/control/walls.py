@@ -19,8 +19,8 @@ WALL_PERIOD_S = 2.0
 class WallMap:
     """Distance to the nearest wall of a map.
 
-    Only length separates the two: a straight run of at least ``WALL_LENGTH_M`` is a wall, which the v-bot does not
-    pass. A box, a chair or a person is an obstacle, even where it touches a wall. Curved walls count as obstacles.
+    Only length tells walls from obstacles: a straight run of at least ``WALL_LENGTH_M`` is a wall, which the v-bot does
+    not pass. A box, a chair or a person is an obstacle, even where it touches a wall. Curved walls count as obstacles.
     """
 
     def __init__(self, static: StaticMap) -> None:

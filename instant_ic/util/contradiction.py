@@ -31,8 +31,8 @@ class Contradiction(IntEnum):
 
 _TEXTS = {
     Contradiction.NONE: "",
-    Contradiction.SLIPPING: "The tracks turn, the robot does not. Free it, or check that the LiDAR's data is live",
-    Contradiction.PUSHED: "The robot moves, its tracks do not. Look who moves it, and check the encoders",
-    Contradiction.OTHER_WAY: "The robot moves the other way than its tracks. Check the motors: inverted or swapped",
-    Contradiction.FARTHER: "The robot moves farther than its tracks. Check pulses_per_metre and the encoders",
+    Contradiction.SLIPPING: "The tracks turn, the robot does not. Free it, or check that the LiDAR's data is live.",
+    Contradiction.PUSHED: "The robot moves, its tracks do not. Look who moves it, and check the encoders.",
+    Contradiction.OTHER_WAY: "The robot moves the other way than its tracks. Check the motors: inverted or swapped.",
+    Contradiction.FARTHER: "The robot moves farther than its tracks. Check pulses_per_metre and the encoders.",
 }

@@ -198,8 +198,11 @@ class Demo(ConsoleBackend):
         v, w = (0.0, 0.0) if stopped else self._command
         before = self.mode
         if stopped:
-            text = "emergency stop button is pressed: release it, then release the stop here"
-            self.mode, self.reason = "stopped", text if self.button else "emergency stop: release it to continue"
+            text = "The robot's emergency stop button is pressed. Release it, then release the stop here."
+            self.mode, self.reason = (
+                "stopped",
+                text if self.button else "Emergency stop is pressed. Release it to continue.",
+            )
         else:
             self.mode, self.reason = self.forced_mode, ""
         self._transitions += before != self.mode

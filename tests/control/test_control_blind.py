@@ -79,6 +79,6 @@ def test_a_blind_robot_does_not_drive_that_way_but_turns_and_drives_the_other_wa
     assert drive(command) == (0.0, 0.0)
     decision = made.frames[-1].decision
     assert decision.hard and decision.blocked and decision.mode == Mode.REAL and decision.reason_code == Reason.BLIND
-    assert "uncover it" in decision.reason
+    assert "Uncover it" in decision.reason
     assert drive((0.0, 0.5)) == pytest.approx((0.0, 0.5))
     assert drive((-command[0], 0.0))[0] * command[0] < 0.0

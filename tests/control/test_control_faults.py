@@ -76,7 +76,7 @@ def test_fault_the_robot_follows_a_v_bot_to_where_nobody_drove_it(x_m: float) ->
         stack.step(FORWARD)
     state = stack.bus.last("/ic/state")
     assert (state.mode, state.reason_code) == (ControlState.STOPPED, ControlState.REASON_RELEASE_CONTROLS)
-    assert "the v-bot's place on the map has jumped" in state.reason
+    assert "The virtual robot's place on the map has jumped" in state.reason
     assert twist_values(stack.bus.last("/cmd_vel")) == NOTHING
 
 

@@ -94,7 +94,7 @@ def test_without_a_virtual_space_the_robot_stops_and_says_why(vspace: Vspace, wo
 
 @pytest.mark.parametrize(
     ("box", "length", "words"),
-    [(None, 6.0, "a wall is in the way"), ((2.5, -1.2, 3.0, 0.8), 16.0, "no way round")],
+    [(None, 6.0, "A wall is in the way"), ((2.5, -1.2, 3.0, 0.8), 16.0, "no way round")],
 )
 def test_where_the_robot_cannot_follow_there_is_no_switch(
     box: tuple[float, float, float, float] | None, length: float, words: str
@@ -193,7 +193,7 @@ def test_a_lost_operator_makes_the_robot_wait_in_virtual_mode_and_then_stop() ->
         made.ages["command"] = age
         frame = made.step(NOTHING)
         assert (frame.decision.mode, frame.command) == (Mode.VIRTUAL, NOTHING)
-        assert frame.decision.reason == "stopped: the operator's link is lost, the robot waits"
+        assert frame.decision.reason == "The operator's link is lost. The robot has stopped."
     # Back in time, hands off: the robot closes up again.
     made.ages["command"] = 0.0
     drive(made, 0.5, NOTHING)
@@ -202,7 +202,7 @@ def test_a_lost_operator_makes_the_robot_wait_in_virtual_mode_and_then_stop() ->
     assert made.step(NOTHING).decision.mode == Mode.STOPPED
     drive(made, 5.0, NOTHING)  # nobody is there: it stays so
     assert made.frames[-1].decision.mode == Mode.STOPPED
-    assert made.frames[-1].decision.reason == "stopped: the operator's link is lost, the robot waits"
+    assert made.frames[-1].decision.reason == "The operator's link is lost. The robot has stopped."
     made.ages["command"] = 0.0
     drive(made, 0.5, FORWARD)
     assert made.frames[-1].decision.mode == Mode.STOPPED  # back, but with a key held

@@ -252,7 +252,7 @@ def test_the_button_on_the_robot_stops_and_only_the_operator_ends_it_once_it_is_
     assert twist_values(stack.bus.last("/cmd_vel")) == (0.0, 0.0)  # before any timer
     state = stack.drive(0.5, None)[-1]
     assert (state.mode, state.estop) == (ControlState.STOPPED, True)
-    assert "release it, then release the stop here" in state.reason
+    assert "Release it, then release the stop here" in state.reason
     assert state.reason_code == Reason.ESTOP_BUTTON
     stack.bus.publish("/operator/estop", Bool(data=False), latched=True)  # while it is pressed
     assert stack.drive(1.0, (0.0, 0.0))[-1].estop

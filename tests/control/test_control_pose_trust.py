@@ -39,7 +39,7 @@ def test_a_doubt_slows_the_robot_and_a_lost_pose_stops_it() -> None:
     drive(made, 0.1, FORWARD)
     stopped = made.frames[-1]
     assert stopped.decision.mode == Mode.STOPPED and stopped.command == NOTHING
-    assert stopped.decision.reason == "let go of the controls to continue (stopped: the robot has lost its place)"
+    assert stopped.decision.reason == "The robot has lost its place on the map. Let go of the controls to continue."
 
 
 def test_once_the_operator_has_let_go_the_robot_drives_slowly_until_its_place_is_recognized() -> None:
@@ -67,7 +67,7 @@ def test_a_pose_that_jumps_stops_the_robot_until_the_operator_lets_go(jump: tupl
     drive(made, 0.1, FORWARD)
     stopped = made.frames[-1]
     assert stopped.decision.mode == Mode.STOPPED and stopped.command == NOTHING
-    assert "stopped: the robot's place on the map has jumped; check where it stands" in stopped.decision.reason
+    assert stopped.decision.reason.startswith("The robot's place on the map has jumped. Check where it stands.")
     drive(made, 1.5, NOTHING)
     drive(made, 0.5, FORWARD)
     assert made.frames[-1].decision.mode == Mode.REAL

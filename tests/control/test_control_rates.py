@@ -108,11 +108,11 @@ def test_a_camera_that_becomes_slow_slows_the_robot_after_two_late_images(world:
     made.drive(FORWARD, 3.0)
     assert made.modes == ["STOPPED", "REAL"], made.changes
     assert min(speed for _, speed in made.speeds[began:]) > 0.2  # slower, without a stop at each image
-    assert "slowed to" in made.state.reason
+    assert "Slowed to" in made.state.reason
     made.one_image_of = 1
     made.drive(FORWARD, 5.0)
     assert made.base.v == pytest.approx(FORWARD[0], abs=0.01)
-    assert "slowed" not in made.state.reason
+    assert "Slowed" not in made.state.reason
 
 
 def test_lost_views_stop_both_robots_in_the_virtual_space_at_one_view_per_second(
@@ -139,7 +139,7 @@ def test_images_that_are_too_rare_are_refused_and_the_reason_says_so() -> None:
     made.drive(NOTHING, 15.0)
     made.drive(FORWARD, 4.0)
     assert made.modes == ["STOPPED"]
-    assert any("waiting for a camera image every 1.1 s or more often" in s.reason for s in made.states[-60:])
+    assert any("waits for a camera image every 1.1 s or more often" in s.reason for s in made.states[-60:])
     assert made.base.pose[0] == 0.0
     made.close()
 

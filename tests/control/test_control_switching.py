@@ -223,7 +223,7 @@ def test_without_a_fitting_view_the_entry_is_given_up_and_the_robot_stops_before
     made.ages["view"] = math.inf if lost == "view" else 0.0
     made.until(Mode.ENTERING, FORWARD)
     made.until(Mode.REAL, FORWARD, entry_patience_s() + 0.1)
-    assert "no view of the virtual space fits here; let go" in made.steps[-1].reason
+    assert "No view of the virtual space fits here. Let go" in made.steps[-1].reason
     # Not tried again and again while the key is held.
     changes = made.steps[-1].transitions
     made.drive(8.0, FORWARD)
@@ -343,7 +343,7 @@ def test_without_views_in_the_virtual_space_both_robots_stand() -> None:
     made.ages["view"] = 0.36
     decision = made.step(FORWARD)
     assert (decision.command, decision.vbot_action) == (NOTHING, VbotAction.HELD)
-    assert "no view of the virtual space for 0.4 s" in decision.reason
+    assert "No view of the virtual space for 0.4 s" in decision.reason
     stood = made.drive(0.6, FORWARD) and made.vbot.pose.copy()
     made.drive(0.6, FORWARD)
     np.testing.assert_allclose(made.vbot.pose, stood, atol=1e-9)
@@ -357,7 +357,7 @@ def test_a_vbot_left_inside_an_obstacle_is_led_back_gently_and_told_and_a_comman
     made.start()
     while made.vbot.pose[0] < 2.6:
         made.step(FORWARD)
-    while "the view goes back to the robot in 2 s" not in made.step(NOTHING).decision.reason:
+    while "The view goes back to the robot in 2 s" not in made.step(NOTHING).decision.reason:
         assert len(made.frames) < 600
     while made.frames[-1].decision.vbot_action != VbotAction.LED_BACK:
         made.step(NOTHING)
@@ -366,7 +366,7 @@ def test_a_vbot_left_inside_an_obstacle_is_led_back_gently_and_told_and_a_comman
     for _ in range(10):
         frame = made.step(NOTHING)
         assert frame.command == NOTHING
-        assert "the view goes back to the robot; drive to continue" in frame.decision.reason
+        assert "the view goes back to the robot. Drive to continue" in frame.decision.reason
     assert 0.02 < np.linalg.norm(made.vbot.pose[:2] - start[:2]) <= 0.1
     assert made.step(FORWARD).decision.vbot_action == VbotAction.DRIVEN
     while made.decision.mode.shows_vbot:

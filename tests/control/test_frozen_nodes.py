@@ -80,7 +80,7 @@ def assert_waits_for_a_release(stack: Stack, text: str) -> None:
     assert {message.header.frame_id for message in stack.bus.messages("/cmd_vel")[since:]} == {HARD_STOP}
     assert states[-1].mode == Mode.STOPPED
     assert states[-1].reason_code == Reason.RELEASE_CONTROLS
-    assert states[-1].reason.startswith("let go of the controls to continue (stopped: ")
+    assert states[-1].reason.endswith(" Let go of the controls to continue.")
     assert text in states[-1].reason
     assert stack.drive(1.0, NOTHING)[-1].mode == Mode.REAL
 
@@ -89,7 +89,7 @@ def assert_waits_for_a_release(stack: Stack, text: str) -> None:
 def test_a_frozen_arbiter_waits_for_a_release(mode: Mode, seconds: float) -> None:
     stack = stack_in(mode)
     freeze(stack, ["arbiter"], seconds)
-    assert_waits_for_a_release(stack, "the robot's control stood still for")
+    assert_waits_for_a_release(stack, "The robot's control stood still for")
 
 
 @pytest.mark.parametrize("names", [("virtual_robot",), ALL], ids="+".join)
@@ -104,7 +104,7 @@ def test_a_suspended_machine_waits_for_a_release(mode: Mode) -> None:
     """The steady clock stands still in suspend: every age looks as before."""
     stack = stack_in(mode)
     stack.bus.clock.suspend(60.0)
-    assert_waits_for_a_release(stack, "this computer was suspended")
+    assert_waits_for_a_release(stack, "This computer was suspended")
 
 
 @pytest.mark.parametrize(
@@ -186,7 +186,7 @@ def test_a_single_zero_of_a_page_that_comes_back_is_no_release() -> None:
 def test_a_key_held_through_a_long_silence_of_the_commands_waits_for_a_release(mode: Mode) -> None:
     stack = stack_in(mode)
     stack.drive(2.0, None)
-    assert_waits_for_a_release(stack, "the operator's link")
+    assert_waits_for_a_release(stack, "The operator's link")
 
 
 def test_a_key_held_while_its_commands_are_late_for_long_waits_for_a_release() -> None:
@@ -195,7 +195,7 @@ def test_a_key_held_while_its_commands_are_late_for_long_waits_for_a_release() -
     for _ in range(60):
         stack.operate(KEY, ahead_s=-0.5)
         stack.step(None)
-    assert_waits_for_a_release(stack, "the operator's link")
+    assert_waits_for_a_release(stack, "The operator's link")
 
 
 def test_a_page_that_is_lost_for_a_moment_is_no_release_after_another_loss() -> None:
@@ -207,7 +207,7 @@ def test_a_page_that_is_lost_for_a_moment_is_no_release_after_another_loss() -> 
     stack.lost_ns = stack.now
     stack.drive(1.2, None)
     assert stack.drive(0.05, NOTHING)[-1].mode == Mode.STOPPED
-    assert_waits_for_a_release(stack, "no camera image")
+    assert_waits_for_a_release(stack, "No camera image")
 
 
 def test_a_page_that_is_lost_and_comes_back_with_its_key_held_waits_for_a_release() -> None:
@@ -217,7 +217,7 @@ def test_a_page_that_is_lost_and_comes_back_with_its_key_held_waits_for_a_releas
     stack.lost_ns = stack.now
     stack.drive(2.0, None)
     stack.drive(0.05, NOTHING)
-    assert_waits_for_a_release(stack, "the operator's link was lost")
+    assert_waits_for_a_release(stack, "The operator's link was lost")
 
 
 @pytest.mark.parametrize("before", [(NOTHING, 0.3), (None, 2.0)], ids=["let go", "no page"])
@@ -264,4 +264,4 @@ def test_several_consoles_with_interleaved_commands_are_no_restart() -> None:
     assert watch.step(0, 0, instances, 1.5) is None
     assert watch.step(1, 0, dict(reversed(instances.items())), 1.5) is None
     found = watch.step(2, 0, instances | {("command", "console"): b"c"}, 1.5)
-    assert found is not None and found.text == "the operator's console (console) was restarted"
+    assert found is not None and found.text == "The operator's console (console) was restarted."

@@ -195,7 +195,7 @@ def test_zeros_of_the_sender_before_are_no_release() -> None:
             operator_command=(speed, 0.0), holder=holder, holder_sends_zeros=holder != "", ages={"command": 0.0}
         )
         notices.append(operator.step(inputs, True, MotionLimits(), 1.5, k * 60_000_000))
-    assert notices == [None] * 4 + [Notice(Reason.OPERATOR_LOST, "the operator's link was lost")]
+    assert notices == [None] * 4 + [Notice(Reason.OPERATOR_LOST, "The operator's link was lost.")]
 
 
 def test_a_driver_who_gives_the_lease_back_while_driving_stops_the_robot(free: Stack) -> None:

@@ -127,7 +127,7 @@ def test_silent_sources_stop_the_robot_after_the_clock_was_set(jump_s: int) -> N
         arbiter.spin_once()
     assert arbiter.inbox.ages(arbiter.config.timeouts)["camera"] == pytest.approx(3.0)
     state = bus.last("/ic/state")
-    assert state.mode == ControlState.STOPPED and "no camera image for 3.0 s" in state.reason
+    assert state.mode == ControlState.STOPPED and "No camera image for 3.0 s" in state.reason
     assert 0 <= clock.now_ns() - stamp_ns(state) < S // 5  # stamps are those of the clock as it is now
     assert len(bus.records("/cmd_vel")) >= 25  # 10 a second for a robot that stands, none left out
     assert all(message.twist.linear.x == 0.0 for message in bus.messages("/cmd_vel"))

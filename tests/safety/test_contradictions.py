@@ -64,7 +64,7 @@ def stops(stack: Stack, command: tuple[float, float], kind: Contradiction, withi
     assert stack.drive(command, 6.0, until=lambda: stack.stopped) <= within_s
     stack.drive(command, 1.0)
     assert stack.stopped and stack.tracks_stand
-    assert stack.page.state["reason"] == f"let go of the controls to continue (stopped: {kind.text})"
+    assert stack.page.state["reason"] == f"{kind.text} Let go of the controls to continue."
     assert stack.state.reason_code == Reason.RELEASE_CONTROLS
 
 
@@ -128,7 +128,7 @@ def test_tracks_that_slip_on_the_spot_stop_and_the_operator_drives_free_slowly(s
     stack.drive(NOTHING, 1.5)
     stack.drive((-0.38, 0.0), 1.0)
     assert abs(robot.tracks).max() < PoseTrustConfig().speed_m_s + 0.01
-    assert stack.page.state["reason"].startswith(f"{Contradiction.SLIPPING.text}; slow until they agree")
+    assert stack.page.state["reason"].startswith(f"{Contradiction.SLIPPING.text} The robot is slow until both agree.")
     stack.drive((-0.38, 0.0), 3.0)
     assert abs(robot.tracks).min() > 0.3 and not stack.stopped
 
@@ -160,7 +160,7 @@ def test_a_lidar_that_is_covered_ahead_stops_the_robot_and_lets_it_turn_and_back
     assert stack.drive(FORWARD, 2.0, until=lambda: stack.state.reason_code == Reason.BLIND) <= 0.45
     stack.drive(FORWARD, 0.6)
     assert stack.tracks_stand
-    ahead = "the LiDAR is covered ahead: uncover it, or drive another way"
+    ahead = "The LiDAR is covered ahead. Uncover it, or drive another way."
     assert stack.page.state["reason"] == ahead
     level, text, _ = stack.nodes["vlp16_driver"].diagnoses()["cover"]
     assert level == ERROR and "from 330° on (clockwise from ahead)" in text and "Uncover the sensor" in text
