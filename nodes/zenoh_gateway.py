@@ -2,28 +2,80 @@
 
 from __future__ import annotations
 
-from typing import Any
+import json
+from dataclasses import dataclass, field
+from typing import Annotated, Any, Literal
 
-from instant_ic.bridge.zenoh_config import ZenohGatewayConfig
-from instant_ic.bridge.zenoh_incoming import Incoming, topic_counts
-from instant_ic.bridge.zenoh_outgoing import Outgoing
+from instant_ic.bridge.commands import COMMANDS, CommandLimits
+from instant_ic.bridge.zenoh_incoming import Incoming, check_subscribe
+from instant_ic.bridge.zenoh_outgoing import Outgoing, parse_publish
 from instant_ic.bridge.zenoh_security import command_security
 from instant_ic.bridge.zenoh_session import (
     CLIENT_DEFAULTS,
+    DEFAULT_ROUTER,
     SESSION_DEFAULTS,
     RosNode,
     RosSession,
     ZenohError,
-    config_path,
-    is_client,
     load_config,
 )
-from instant_ic.bridge.zenoh_topics import Namespace, parse_subscribe
 from instant_ic.bus import ERROR, OK, WARN, Node, NodeError, main, registry
 from instant_ic.bus.registry import TopicWatch
-from instant_ic.msg import MessageError
+from instant_ic.config.ranges import Range, check_ranges
 
-_AGAIN_S = 2.0
+RETRY_S = 2.0
+"""Seconds between attempts of a client to reach its router."""
+
+_LOOK_S = 0.2  # between searches for new and removed topics
+
+
+@dataclass(frozen=True)
+class ZenohGatewayConfig:
+    """Parameters.
+
+    Attributes:
+        namespace: the robot's name in the fleet; ``/scan`` here is ``/robot1/scan`` there. Empty: names stay.
+        domain: ROS domain (``ROS_DOMAIN_ID``).
+        mode: peer: of a router on this host, as rmw_zenoh; client: of a router elsewhere.
+        connect: routers to connect to; empty: tcp/localhost:7447, or those of the session file.
+        session_file: Zenoh configuration (JSON5), path or file of config/, which replaces mode; empty: none.
+        publish: topics to send: NAME or PATTERN, optionally followed by rate_hz=N for at most N messages per second.
+        subscribe: topics to receive, names or patterns.
+        commands: operators' commands to accept: /operator/cmd_vel, /operator/estop. Only over TLS with certificates on
+            both sides (session_file); without it only pressing the emergency stop.
+        insecure_loopback_commands: accept commands without TLS where every link stays within this machine, as in a
+            simulation; anybody who can run a program on it can then drive. Refused beside a real base.
+        unprotected: allows it beside a real base, with a permanent warning.
+        limits: limits on the commands.
+    """
+
+    namespace: str = ""
+    domain: Annotated[int, Range(0, 232)] = 0
+    mode: Literal["peer", "client"] = "peer"
+    connect: tuple[str, ...] = ()
+    session_file: str = ""
+    publish: tuple[str, ...] = ()
+    subscribe: tuple[str, ...] = ()
+    commands: tuple[str, ...] = ()
+    insecure_loopback_commands: bool = False
+    unprotected: bool = False
+    limits: CommandLimits = field(default_factory=CommandLimits)
+
+    def __post_init__(self) -> None:
+        check_ranges(self)
+        parse_publish(self.publish)
+        check_subscribe(self.subscribe)
+        try:
+            registry.check_topic(self.prefix or "/none")
+        except registry.RegistryError:
+            raise ValueError(f"namespace {self.namespace!r} must look like robot1 or fleet/robot1") from None
+        if unknown := set(self.commands) - set(COMMANDS):
+            raise ValueError(f"commands may only hold {', '.join(COMMANDS)} (got {', '.join(sorted(unknown))})")
+
+    @property
+    def prefix(self) -> str:
+        """Text before the names of topics in the ROS graph: ``/robot1``; empty without a namespace."""
+        return f"/{self.namespace}" if self.namespace else ""
 
 
 class ZenohGatewayNode(Node[ZenohGatewayConfig]):
@@ -31,7 +83,6 @@ class ZenohGatewayNode(Node[ZenohGatewayConfig]):
 
     name = "zenoh_gateway"
     session: RosSession | None = None
-    _zenoh: Any
     _no_commands = ""
 
     def setup(self) -> None:
@@ -46,23 +97,21 @@ class ZenohGatewayNode(Node[ZenohGatewayConfig]):
         self._watch = TopicWatch(self.run_dir)
         self._lost = 0
         try:
-            parse_subscribe(config.subscribe)
             defaults = CLIENT_DEFAULTS if config.mode == "client" else SESSION_DEFAULTS
-            self._zenoh = load_config(config_path(config.session_file), config.connect, defaults=defaults)
-            client = is_client(self._zenoh)
+            self._zenoh: Any = load_config(config.session_file, config.connect, defaults=defaults)
             if config.commands:
                 level, text = command_security(self._zenoh, config.insecure_loopback_commands)
                 self.diagnose("commands", level, text)
                 self._no_commands = text if level == ERROR else ""
-            if not client:
+            if json.loads(self._zenoh.get_json("mode")) != "client":
                 self.opened(RosSession(self._zenoh, config.domain))
-        except (ZenohError, MessageError, FileNotFoundError, registry.RegistryError) as error:
+        except ZenohError as error:
             raise NodeError(str(error)) from None
-        if client:  # its router may start later
+        if self.session is None:  # a client's router may start later
             self._opener = self.background(self.open, self.opened)
             self._opener.submit(None)
-            self.timer(_AGAIN_S, self.try_again)
-        self.timer(config.discovery_period_s, self.look)
+            self.timer(RETRY_S, self.try_again)
+        self.timer(_LOOK_S, self.look)
         self.timer(1.0, self.report)
 
     def open(self, _: None) -> RosSession | ZenohError:
@@ -79,12 +128,12 @@ class ZenohGatewayNode(Node[ZenohGatewayConfig]):
         if self.stopping:
             session.close()
             return
-        config, namespace = self.config, Namespace(self.config.namespace)
-        self.session = session
-        own = RosNode(session, namespace.ros, self.node_name)
-        self.outgoing = Outgoing(self, session, namespace, own, config.publish)
-        self.incoming = Incoming(self, namespace, own, config.subscribe, config.commands, self.gate, self._no_commands)
-        self.outgoing.brought_in = self.incoming.wants
+        config, self.session = self.config, session
+        own = RosNode(session, config.prefix or "/", self.node_name)
+        self.incoming = Incoming(
+            self, own, config.prefix, config.subscribe, config.commands, self.gate, self._no_commands
+        )
+        self.outgoing = Outgoing(self, own, config.prefix, config.publish, self.incoming.wants)
         session.watch(self.incoming.on_token)
         self.look()
 
@@ -93,25 +142,29 @@ class ZenohGatewayNode(Node[ZenohGatewayConfig]):
             self._opener.submit(None)
 
     def look(self) -> None:
-        if self.session is None:
-            return
-        self.outgoing.reconcile(self._watch.topics())
-        self.incoming.reconcile()
+        if self.session is not None:
+            self.outgoing.reconcile(self._watch.topics())
+            self.incoming.reconcile()
 
     def report(self) -> None:
         if self.session is None:
             return
         routers, peers = self.session.routers(), self.session.peers()
         if routers or peers:
-            self.diagnose("link", OK, f"{len(routers)} routers, {len(peers)} peers")
+            self.diagnose("link", OK, f"{routers} routers, {peers} peers")
         else:
-            where = ", ".join(self.config.connect) or self.config.session_file or "tcp/localhost:7447"
+            where = ", ".join(self.config.connect) or self.config.session_file or DEFAULT_ROUTER
             self.diagnose("link", WARN, f"no router answers at {where}: is it running? (ic run zenoh_router)")
-        text, lost, values = topic_counts(self.outgoing, self.incoming)
-        level = WARN if lost > self._lost else OK
-        self._lost = lost
+        outgoing, incoming, lost = self.outgoing, self.incoming, self.incoming.lost()
+        text = f"{outgoing.count} messages out on {len(outgoing.topics)} topics, "
+        text += f"{incoming.count} in on {len(incoming.topics)}"
+        if lost:
+            text += f"; lost: {', '.join(f'{topic} {count}' for topic, count in lost.items())}"
+        level = WARN if sum(lost.values()) > self._lost else OK
+        self._lost = sum(lost.values())
         refused = {f"refused: {verdict.name.lower()}": count for verdict, count in self.gate.refused.items()}
-        self.diagnose("topics", level, text, **values, **refused)
+        counts = {"thinned": outgoing.thinned, "malformed": incoming.malformed(), **refused}
+        self.diagnose("topics", level, text, **counts)
 
     def teardown(self) -> None:
         if self.session is not None:

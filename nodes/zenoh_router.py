@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-from instant_ic.bridge.zenoh_session import ROUTER_DEFAULTS, ZenohError, config_path, load_config, open_zenoh
+from instant_ic.bridge.zenoh_session import ROUTER_DEFAULTS, ZenohError, load_config, open_zenoh
 from instant_ic.bus import OK, Node, NodeError, main
 
 
@@ -30,9 +30,9 @@ class ZenohRouterNode(Node[ZenohRouterConfig]):
 
     def setup(self) -> None:
         try:
-            path = config_path(self.config.session_file)
-            self.session = open_zenoh(load_config(path, (), self.config.listen, ROUTER_DEFAULTS))
-        except (ZenohError, FileNotFoundError) as error:
+            config = load_config(self.config.session_file, (), self.config.listen, ROUTER_DEFAULTS)
+            self.session = open_zenoh(config)
+        except ZenohError as error:
             raise NodeError(str(error)) from None
         self.log.info("router %s", self.session.info.zid())
         self.timer(1.0, self.report)

@@ -12,6 +12,8 @@ import struct
 from dataclasses import dataclass
 from typing import Literal
 
+from instant_ic.bus.qos import LATCHED, RELIABLE, SENSOR, QoS
+
 ADMIN_SPACE = "@ros2_lv"
 GID_SIZE = 16
 """Bytes of a publisher's id."""
@@ -20,11 +22,13 @@ SENDER_SIZE = 8
 """Leading bytes of the id that all publishers of one of our sessions share. They show that a drive command and the
 release of an emergency stop come from the same sender. In ids of ROS 2 publishers all bytes are individual."""
 
+QOS_TEXT = {SENSOR: "2::,5:,:,:,,", RELIABLE: "::,10:,:,:,,", LATCHED: ":1:,1:,:,:,,"}
+"""Tokens' QoS of a preset, ``reliability:durability:history,depth:deadline:lifespan:liveliness``; empty is a default.
+2 is best effort, 1 is transient local."""
+
 _ATTACHMENT = struct.Struct("<qqB16s")
 _DDS_TYPE = re.compile(r"(\w+)::(\w+)::dds_::(\w+)_\Z")
 _ROS_TYPE = re.compile(r"(\w+)/(\w+)/(\w+)\Z")
-_ENDPOINT_PARTS = 13
-_DEFAULT_DEPTH = 42
 
 Kind = Literal["NN", "MP", "MS"]
 """Node, publisher, subscription."""
@@ -55,12 +59,7 @@ class Attachment:
 
     def pack(self) -> bytes:
         """Return the 33 bytes, as Zenoh's serializer writes ``(i64, i64, bytes)``."""
-        if len(self.gid) != GID_SIZE:
-            raise FormatError(f"publisher id of {len(self.gid)} bytes, {GID_SIZE} expected")
-        try:
-            return _ATTACHMENT.pack(self.sequence, self.source_ns, GID_SIZE, self.gid)
-        except struct.error as error:
-            raise FormatError(f"attachment: {error}") from None
+        return _ATTACHMENT.pack(self.sequence, self.source_ns, GID_SIZE, self.gid)
 
     @classmethod
     def unpack(cls, data: bytes) -> Attachment:
@@ -92,48 +91,14 @@ def data_key(domain: int, topic: str, type_name: str, type_hash: str) -> str:
     return f"{domain}/{topic.strip('/')}/{dds_type(type_name)}/{type_hash}"
 
 
-def mangled(name: str) -> str:
-    """Return a name as one part of a token: ``/`` becomes ``%``, an empty name ``%``."""
-    return name.replace("/", "%") or "%"
-
-
-@dataclass(frozen=True)
-class TopicQoS:
-    """The fields of ROS 2's quality of service that tokens carry here; all others have defaults.
-
-    Attributes:
-        reliable: reliable if true, otherwise best effort.
-        latched: transient local if true (a late subscriber gets the last ``depth`` messages), otherwise volatile.
-        depth: messages kept; 0 keeps all.
-    """
-
-    reliable: bool = True
-    latched: bool = False
-    depth: int = _DEFAULT_DEPTH
-
-    def encode(self) -> str:
-        """Return ``reliability:durability:history,depth:deadline:lifespan:liveliness``; defaults are empty."""
-        reliability = "" if self.reliable else "2"
-        durability = "1" if self.latched else ""
-        depth = "" if self.depth == _DEFAULT_DEPTH else str(self.depth)
-        history = f",{depth}" if self.depth else "2,"
-        return f"{reliability}:{durability}:{history}:,:,:,,"
-
-    @classmethod
-    def decode(cls, text: str) -> TopicQoS:
-        """Parse the QoS part of a token."""
-        parts = text.split(":")
-        if len(parts) != 6:
-            raise FormatError(f"quality of service {text!r} has {len(parts)} parts, 6 expected")
-        history, _, depth = parts[2].partition(",")
-        if not (depth.isascii() and depth.isdecimal()) and depth:
-            raise FormatError(f"quality of service {text!r}: depth {depth!r} is not a number")
-        keep_all = history == "2"
-        return cls(
-            reliable=parts[0] != "2",
-            latched=parts[1] == "1",
-            depth=0 if keep_all else int(depth) if depth else _DEFAULT_DEPTH,
-        )
+def closest_qos(text: str) -> QoS:
+    """Return the preset that is closest to a token's QoS."""
+    parts = text.split(":")
+    if len(parts) != 6:
+        raise FormatError(f"quality of service {text!r} has {len(parts)} parts, 6 expected")
+    if parts[1] == "1":
+        return LATCHED
+    return SENSOR if parts[0] == "2" else RELIABLE
 
 
 @dataclass(frozen=True)
@@ -159,25 +124,28 @@ class Token:
     topic: str = ""
     type_name: str = ""
     type_hash: str = ""
-    qos: TopicQoS = TopicQoS()
+    qos: QoS = RELIABLE
 
     def key(self) -> str:
         """Return the token's key."""
         head = f"{ADMIN_SPACE}/{self.domain}/{self.session}/{self.node_id}/{self.entity_id}/{self.kind}"
-        node = f"{head}/%/{mangled(self.namespace)}/{mangled(self.node)}"
+        node = f"{head}/%/{self.namespace.replace('/', '%')}/{self.node}"
         if self.kind == "NN":
             return node
-        return f"{node}/{mangled(self.topic)}/{dds_type(self.type_name)}/{self.type_hash}/{self.qos.encode()}"
+        topic = self.topic.replace("/", "%")
+        return (
+            f"{node}/{topic}/{dds_type(self.type_name)}/{self.type_hash}/{QOS_TEXT.get(self.qos, QOS_TEXT[RELIABLE])}"
+        )
 
     @classmethod
     def parse(cls, key: str) -> Token | None:
         """Parse the token of a node, publisher or subscription; return None for a service's, which is not used here."""
         parts = key.split("/")
-        if len(parts) < 9 or parts[0] != ADMIN_SPACE or not all(parts):
-            raise FormatError(f"{key!r} is not a liveliness token of rmw_zenoh")
-        kind = parts[5]
+        kind = parts[5] if len(parts) >= 9 and parts[0] == ADMIN_SPACE and all(parts) else ""
         if kind in ("SS", "SC"):
             return None
+        if not (kind == "NN" or (kind in ("MP", "MS") and len(parts) == 13)):
+            raise FormatError(f"{key!r} is not a liveliness token of rmw_zenoh")
         try:
             domain, node_id, entity_id = (int(parts[index]) for index in (1, 3, 4))
         except ValueError:
@@ -186,13 +154,5 @@ class Token:
         entity = (domain, parts[2], node_id, entity_id, namespace, node)
         if kind == "NN":
             return cls("NN", *entity)
-        if kind not in ("MP", "MS") or len(parts) != _ENDPOINT_PARTS:
-            raise FormatError(f"{key!r} is not a liveliness token of rmw_zenoh")
-        return cls(
-            "MP" if kind == "MP" else "MS",
-            *entity,
-            topic=parts[9].replace("%", "/"),
-            type_name=ros_type(parts[10]),
-            type_hash=parts[11],
-            qos=TopicQoS.decode(parts[12]),
-        )
+        endpoint = (parts[9].replace("%", "/"), ros_type(parts[10]), parts[11], closest_qos(parts[12]))
+        return cls("MP" if kind == "MP" else "MS", *entity, *endpoint)

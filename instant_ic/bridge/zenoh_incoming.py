@@ -2,91 +2,113 @@
 
 from __future__ import annotations
 
+import fnmatch
 import logging
 import threading
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
 from typing import Any
 
 from instant_ic.bridge.commands import COMMANDS, DRIVE, STOP
-from instant_ic.bridge.zenoh_format import Attachment, FormatError, Token, TopicQoS, data_key
-from instant_ic.bridge.zenoh_outgoing import Outgoing
+from instant_ic.bridge.zenoh_format import Attachment, FormatError, Token, data_key
+from instant_ic.bridge.zenoh_outgoing import GRACE_S, known_hash
 from instant_ic.bridge.zenoh_session import RosNode, zenoh
-from instant_ic.bridge.zenoh_topics import (
-    ACTED_ON,
-    GRACE_S,
-    Namespace,
-    bus_qos,
-    known_hash,
-    parse_subscribe,
-    takes,
-)
-from instant_ic.bus import ERROR, OK, Node, Publisher
+from instant_ic.bus import ERROR, LATCHED, OK, RELIABLE, Node, Publisher, QoS
+from instant_ic.bus.heartbeat import EVERY_NODES
 from instant_ic.bus.registry import RegistryError
 from instant_ic.control.command_gate import CommandGate
 from instant_ic.control.robot_lease import RELEASED, Refusal, Verdict, sender_name
 from instant_ic.msg import MessageError, deserialize, message_type, serialize, twist_stamped, twist_values, type_hash
 
-_TF = "tf2_msgs/msg/TFMessage"
+ACTED_ON = ("*/operator/*", "*/cmd_vel", "*/robot/estop", "*/parameter_events")
+"""Topics that move a robot, in any namespace, and parameter events: never imported by `subscribe`."""
+
 MAX_TOPICS, MAX_SOURCES, MAX_NAME = 512, 64, 200
 """Most imported topics, publishers per topic, and characters of a name: limits against a hostile ROS graph."""
-
 
 MAX_PUBLISHERS = 256
 """Most publishers per topic whose gaps are counted; needed because senders choose their ids freely."""
 
+_TF = "tf2_msgs/msg/TFMessage"
 log = logging.getLogger(__name__)
 
 
-class RosSubscription:
-    """A subscription in the ROS graph. It receives only from other sessions, so our own messages do not return.
+def _matches(topic: str, patterns: Sequence[str]) -> bool:
+    return any(fnmatch.fnmatchcase(topic, pattern) for pattern in patterns)
 
-    Messages of another definition have another key and are not received. A latched subscription requests earlier
-    messages from the publishers.
+
+def check_subscribe(entries: Sequence[str]) -> None:
+    """Check names and patterns such as ``/scan`` and ``/robot*/pose``.
+
+    Raises:
+        ValueError: a name does not begin with a slash, or names a topic that moves a robot.
+    """
+    for topic in entries:
+        if not topic.startswith("/") or " " in topic:
+            raise ValueError(f"subscribe: {topic!r} must be /TOPIC or a pattern")
+        if not {"*", "?", "["} & set(topic) and _matches(topic, ACTED_ON):
+            raise ValueError(f"subscribe: {topic} moves a robot; list it under commands, or rename it there")
+
+
+class _Imported:
+    """An imported topic: a subscription in the ROS graph and a publisher on the bus.
+
+    It receives only from other sessions, so our own messages do not return. Messages of another definition have another
+    key and are not received. A latched subscription requests the last message from each publisher.
 
     Args:
-        node, topic, type_name, type_hash, qos: as for :class:`RosPublisher`.
-        on_message: called with ``(payload, attachment)``, in order per publisher, on a Zenoh thread.
+        own: the gateway in the ROS graph.
+        topic: name of the topic on the bus.
+        prefix: put before it in the ROS graph.
+        type_name: ``std_msgs/msg/String``.
+        qos: preset of the topic.
+        publisher: publisher on the bus.
+        on_message: called with ``(imported, payload, attachment)``, in order per publisher, on a Zenoh thread.
 
     Attributes:
-        count: messages passed on.
-        lost: messages lost on the way.
+        sources: publishers in the ROS graph by session and entity.
+        gone_s: time at which the last of them left; None while there are some, or before the first.
+        count, lost: messages passed on, and messages lost on the way.
         malformed: messages refused because they have no readable attachment.
+        static: newest static transform of each child frame, if the topic is latched transforms. Several nodes send one
+            message each, but our publisher keeps one latched value: their union.
     """
 
     def __init__(
         self,
-        node: RosNode,
+        own: RosNode,
         topic: str,
+        prefix: str,
         type_name: str,
-        type_hash: str,
-        qos: TopicQoS,
-        on_message: Callable[[bytes, Attachment], None],
+        qos: QoS,
+        publisher: Publisher,
+        on_message: Callable[[_Imported, bytes, Attachment], None],
     ) -> None:
-        package = zenoh()
-        session = node.session
         self.topic = topic
-        self.count = 0
-        self.lost = 0
-        self.malformed = 0
+        self.type_name = type_name
+        self.publisher = publisher
+        self.sources: set[tuple[str, int]] = set()
+        self.gone_s: float | None = None
+        self.count = self.lost = self.malformed = 0
+        self.static: dict[str, Any] | None = {} if qos.latched and type_name == _TF else None
         self._sequences: dict[bytes, int] = {}
         self._on_message = on_message
-        key = data_key(session.domain, topic, type_name, type_hash)
+        package, session, hash_ = zenoh(), own.session.zenoh, type_hash(type_name)
+        key = data_key(own.session.domain, prefix + topic, type_name, hash_)
         remote = package.Locality.REMOTE
         if qos.latched:
             self._subscriber = package.ext.declare_advanced_subscriber(
-                session.zenoh,
+                session,
                 key,
                 self._heard,
                 allowed_origin=remote,
-                history=package.ext.HistoryConfig(detect_late_publishers=True, max_samples=qos.depth or 1),
+                history=package.ext.HistoryConfig(detect_late_publishers=True, max_samples=1),
                 recovery=package.ext.RecoveryConfig(periodic_queries=None, heartbeat=True),
                 subscriber_detection=True,
             )
         else:
-            self._subscriber = session.zenoh.declare_subscriber(key, self._heard, allowed_origin=remote)
-        self._token = node.endpoint("MS", topic, type_name, type_hash, qos)
+            self._subscriber = session.declare_subscriber(key, self._heard, allowed_origin=remote)
+        self._token = own.endpoint("MS", prefix + topic, type_name, hash_, qos)
 
     def _heard(self, sample: Any) -> None:
         try:
@@ -98,93 +120,69 @@ class RosSubscription:
             if self.malformed == 1:
                 log.error("%s: refused a message not made by rmw_zenoh: %s", self.topic, error)
             return
-        last = self._sequences.pop(attachment.gid, None)
-        if last is not None:
-            if attachment.sequence <= last:  # duplicate
-                self._sequences[attachment.gid] = last
-                return
-            self.lost += attachment.sequence - last - 1
-        self._sequences[attachment.gid] = attachment.sequence
+        last = self._sequences.pop(attachment.gid, attachment.sequence - 1)
+        self._sequences[attachment.gid] = max(attachment.sequence, last)
+        if attachment.sequence <= last:  # duplicate
+            return
+        self.lost += attachment.sequence - last - 1
         if len(self._sequences) > MAX_PUBLISHERS:  # the publisher not heard from for the longest time
             del self._sequences[next(iter(self._sequences))]
         self.count += 1
-        self._on_message(sample.payload.to_bytes(), attachment)
+        self._on_message(self, sample.payload.to_bytes(), attachment)
+
+    def merge(self, payload: bytes) -> bytes | memoryview:
+        """Return all static transforms so far as one message; other payloads unchanged.
+
+        Raises:
+            MessageError: the bytes are not a TFMessage.
+        """
+        if self.static is None:
+            return payload
+        self.static |= {each.child_frame_id: each for each in deserialize(payload, _TF).transforms}
+        return serialize(message_type(_TF)(list(self.static.values())))
 
     def close(self) -> None:
         self._token.undeclare()
         self._subscriber.undeclare()
 
 
-class StaticTransforms:
-    """Union of ``/tf_static`` messages: several nodes send one each, but our publisher keeps one latched value."""
-
-    def __init__(self) -> None:
-        self._transforms: dict[str, Any] = {}
-
-    def merge(self, payload: bytes) -> bytes | memoryview:
-        """Return all transforms so far as one message, with the newest of each child frame.
-
-        Raises:
-            MessageError: the bytes are not a TFMessage.
-        """
-        for transform in deserialize(payload, _TF).transforms:
-            self._transforms[transform.child_frame_id] = transform
-        return serialize(message_type(_TF)(list(self._transforms.values())))
-
-
-@dataclass
-class _In:
-    """An imported topic."""
-
-    type_name: str
-    qos: TopicQoS
-    publisher: Publisher
-    own_publisher: bool
-    always: bool
-    subscription: RosSubscription | None = None
-    sources: set[tuple[str, int]] = field(default_factory=set)
-    gone_s: float | None = None
-
-
 class Incoming:
     """Imports topics of the ROS graph unchanged, with their original time of publication.
 
     Args:
-        namespace: namespace of the topics in the ROS graph.
-        own: the gateway itself in the ROS graph.
+        node: the gateway.
+        own: the gateway in the ROS graph.
+        prefix: stands before the names of topics in the ROS graph: ``/robot1``, or empty.
         subscribe: names or patterns of topics, by local names; a topic exists once a publisher appears.
         commands: those of :data:`COMMANDS` that are accepted.
         gate: checks commands.
         no_commands: why only an emergency stop is accepted as a command; empty if the link is secure.
-
-    Raises:
-        ValueError: a topic in the list is wrong.
     """
 
     def __init__(
         self,
         node: Node[Any],
-        namespace: Namespace,
         own: RosNode,
+        prefix: str,
         subscribe: Sequence[str],
         commands: Sequence[str],
         gate: CommandGate,
         no_commands: str = "",
     ) -> None:
-        self._no_commands = no_commands
         self._node = node
-        self._namespace = namespace
+        self._own = own
+        self._prefix = prefix
+        self._patterns = tuple(subscribe)
+        self._no_commands = no_commands
         self._gate = gate
         self._gate_lock = threading.Lock()  # each subscription calls on its own thread
-        self._topics: dict[str, _In] = {}
+        self._topics: dict[str, _Imported] = {}
         self._refusing: set[str] = set()
         self._driver = ""  # sender of the newest drive command, as the arbiter knows it
         self._count_before = 0
-        self._patterns = parse_subscribe(subscribe)
         self._commands = set(commands) & {STOP} if no_commands else set(commands)
-        self._own = own
         for topic in self._commands:
-            self._open(topic, COMMANDS[topic], TopicQoS(latched=topic == STOP, depth=1), always=True)
+            self._open(topic, COMMANDS[topic], LATCHED if topic == STOP else RELIABLE)
 
     @property
     def topics(self) -> list[str]:
@@ -193,16 +191,18 @@ class Incoming:
     @property
     def count(self) -> int:
         """Messages received, including refused commands."""
-        held = [entry.subscription for entry in self._topics.values() if entry.subscription is not None]
-        return self._count_before + sum(subscription.count for subscription in held)
+        return self._count_before + sum(topic.count for topic in self._topics.values())
 
     def lost(self) -> dict[str, int]:
         """Return the lost messages by topic."""
-        held = {topic: entry.subscription for topic, entry in self._topics.items()}
-        return {topic: s.lost for topic, s in held.items() if s is not None and s.lost}
+        return {name: topic.lost for name, topic in sorted(self._topics.items()) if topic.lost}
 
     def malformed(self) -> int:
-        return sum(entry.subscription.malformed for entry in self._topics.values() if entry.subscription is not None)
+        return sum(topic.malformed for topic in self._topics.values())
+
+    def wants(self, topic: str) -> bool:
+        """Return whether a topic is imported once it has a publisher in the ROS graph."""
+        return topic in self._commands or (_matches(topic, self._patterns) and not _matches(topic, ACTED_ON))
 
     def on_token(self, token: Token, alive: bool) -> None:
         """Follow the ROS graph; may be called from any thread."""
@@ -210,17 +210,18 @@ class Incoming:
             self._node.call_soon(self._follow, token, alive)
 
     def _follow(self, token: Token, alive: bool) -> None:
-        topic = self._namespace.to_local(token.topic)
-        if topic is None or not self.wants(topic):
+        topic = token.topic.removeprefix(self._prefix)
+        if not token.topic.startswith(f"{self._prefix}/") or not self.wants(topic):
             return
         source = (token.session, token.entity_id)
-        entry = self._topics.get(topic)
+        imported = self._topics.get(topic)
         if not alive:
-            if entry is not None and source in entry.sources:
-                self._left(topic, entry, source)
+            if imported is not None and source in imported.sources:
+                self._left(imported, source)
             return
-        sources = entry.sources if entry is not None else ()
-        if len(topic) > MAX_NAME or (entry is None and len(self._topics) >= MAX_TOPICS) or len(sources) >= MAX_SOURCES:
+        sources = imported.sources if imported is not None else ()
+        full = len(sources) >= MAX_SOURCES or (imported is None and len(self._topics) >= MAX_TOPICS)
+        if full or len(topic) > MAX_NAME:
             self._node.diagnose(
                 "names",
                 ERROR,
@@ -228,143 +229,96 @@ class Incoming:
                 f"{MAX_NAME} characters a name; narrow `subscribe`",
             )
             return
-        if not self._same_type(topic, token, entry):
+        type_name = imported.type_name if imported is not None else token.type_name
+        if (token.type_name, token.type_hash) != (type_name, ours := known_hash(type_name)):
+            theirs, here = f"{token.type_name} ({token.type_hash})", f"{type_name} ({ours or 'unknown'})"
+            text = f"not imported: {token.node} there sends {theirs}, the definition here is {here}"
+            self._node.diagnose(f"in {topic}", ERROR, text)
             return
-        if entry is None or (token.qos.latched and not entry.qos.latched):
+        if imported is None:
             try:
-                entry = self._open(topic, token.type_name, token.qos, entry is not None and entry.always)
+                imported = self._open(topic, token.type_name, token.qos)
             except RegistryError as error:
                 self._node.diagnose(f"in {topic}", ERROR, str(error))
                 return
-        entry.sources.add(source)
-        entry.gone_s = None
+        imported.sources.add(source)
+        imported.gone_s = None
 
-    def wants(self, topic: str) -> bool:
-        """Return whether a topic is imported once it has a publisher in the ROS graph."""
-        if topic in self._commands:
-            return True
-        return takes(self._patterns, topic) and not takes(ACTED_ON, topic)
-
-    def _same_type(self, topic: str, token: Token, entry: _In | None) -> bool:
-        """Check that a ROS publisher's type is that of the local topic; report a mismatch."""
-        wanted = entry.type_name if entry is not None else token.type_name
-        ours = known_hash(wanted)
-        if token.type_name != wanted:
-            why = f"{wanted} expected"
-        elif ours is None:
-            why = "which is not known here"
-        elif token.type_hash != ours:
-            why = f"by another definition ({token.type_hash}, ours is {ours})"
-        else:
-            return True
-        text = f"{token.node} there sends {token.type_name}, {why}; it is not imported"
-        self._node.diagnose(f"in {topic}", ERROR, text)
-        return False
-
-    def _open(self, topic: str, type_name: str, qos: TopicQoS, always: bool) -> _In:
-        """Import a topic; if it is already imported, replace it with the new quality of service."""
-        sources: set[tuple[str, int]] = set()
-        if (old := self._topics.pop(topic, None)) is not None:
-            sources = old.sources
-            self._shut(old)
+    def _open(self, topic: str, type_name: str, qos: QoS) -> _Imported:
         name = message_type(type_name).__msgtype__
         # The gateway itself publishes /heartbeat and the like; other nodes' messages share that publisher.
         publisher = next((p for p in self._node.publishers if p.topic == topic), None)
-        own = publisher is not None
         if publisher is None:
-            publisher = self._node.publisher_raw(topic, name, bus_qos(qos))
-        entry = self._topics[topic] = _In(name, qos, publisher, own, always, sources=sources)
-        handle = self._handler(topic, entry)
-        there = self._namespace.to_ros(topic)
-        entry.subscription = RosSubscription(self._own, there, name, type_hash(name), qos, handle)
-        self._node.log.debug("%s is imported as %s", there, topic)
-        return entry
+            publisher = self._node.publisher_raw(topic, name, qos)
+        handle = self._command if topic in self._commands else self._plain
+        imported = _Imported(self._own, topic, self._prefix, name, qos, publisher, handle)
+        self._topics[topic] = imported
+        self._node.log.debug("%s is imported as %s", self._prefix + topic, topic)
+        return imported
 
-    def _handler(self, topic: str, entry: _In) -> Callable[[bytes, Attachment], None]:
-        publish = entry.publisher.publish_bytes
-        merge = StaticTransforms().merge if entry.qos.latched and entry.type_name == _TF else None
+    def _plain(self, imported: _Imported, payload: bytes, attachment: Attachment) -> None:
+        try:
+            imported.publisher.publish_bytes(imported.merge(payload), attachment.source_ns)
+        except MessageError as error:
+            self._report(imported.topic, ERROR, f"refused: {error}")
 
-        def plain(payload: bytes, attachment: Attachment) -> None:
-            if merge is None:
-                publish(payload, attachment.source_ns)
+    def _command(self, imported: _Imported, payload: bytes, attachment: Attachment) -> None:
+        topic = imported.topic
+        with self._gate_lock:
+            passed = self._check(imported, payload, attachment)
+            if isinstance(passed, Refusal):
+                self._refusing.add(topic)
+                self._report(topic, ERROR, f"command refused: {passed.text}")
                 return
-            try:
-                publish(merge(payload), attachment.source_ns)
-            except MessageError as error:
-                self._tell(topic, ERROR, f"refused: {error}")
+            if topic in self._refusing:
+                self._refusing.discard(topic)
+                self._report(topic, OK, "commands are accepted")
+            imported.publisher.publish_bytes(passed, attachment.source_ns)
 
-        def command(payload: bytes, attachment: Attachment) -> None:
-            with self._gate_lock:
-                passed = self._check(topic, entry, payload, attachment)
-                if isinstance(passed, Refusal):
-                    self._refusing.add(topic)
-                    self._tell(topic, ERROR, f"command refused: {passed.text}")
-                    return
-                if topic in self._refusing:
-                    self._refusing.discard(topic)
-                    self._tell(topic, OK, "commands are accepted")
-                publish(passed, attachment.source_ns)
-
-        return command if topic in self._commands else plain
-
-    def _check(self, topic: str, entry: _In, payload: bytes, attachment: Attachment) -> bytes | memoryview | Refusal:
+    def _check(self, imported: _Imported, payload: bytes, attachment: Attachment) -> bytes | memoryview | Refusal:
         """Return the command to publish, or why not; a drive command names its sender, whatever that claims to be."""
         gate, age_s, steady_ns = self._gate, (time.time_ns() - attachment.source_ns) / 1e9, time.monotonic_ns()
         try:
-            message = deserialize(payload, COMMANDS[topic])
+            message = deserialize(payload, COMMANDS[imported.topic])
         except MessageError as error:
             return gate.refuse(Verdict.UNREADABLE, str(error))
-        if topic == STOP:
+        if imported.topic == STOP:
             # A stop is never too old, and every sender may stop. Only the driver may release, with a recent message.
             if message.data:
                 return payload
             if self._no_commands:
                 return gate.refuse(Verdict.INSECURE, f"release: {self._no_commands}")
             return gate.admit_release(attachment.sender, age_s, steady_ns) or payload
-        if not entry.sources:
+        if not imported.sources:
             return gate.refuse(Verdict.NO_SENDER, "the ROS graph has no publisher of this topic")
         if (refusal := gate.admit(*twist_values(message), age_s, attachment.sender, steady_ns)) is not None:
             return refusal
         self._driver = message.header.frame_id = sender_name(attachment.sender, message.header.frame_id)
         return serialize(message)
 
-    def _tell(self, topic: str, level: int, words: str) -> None:
-        self._node.call_soon(self._node.diagnose, f"in {topic}", level, words)
+    def _report(self, topic: str, level: int, text: str) -> None:
+        self._node.call_soon(self._node.diagnose, f"in {topic}", level, text)
 
-    def _left(self, topic: str, entry: _In, source: tuple[str, int]) -> None:
+    def _left(self, imported: _Imported, source: tuple[str, int]) -> None:
         """Handle a ROS publisher that is gone; if it was the last driver, stop the robot."""
         with self._gate_lock:  # its command in transit must not follow the zero
-            entry.sources.remove(source)
-            if entry.sources:
+            imported.sources.remove(source)
+            if imported.sources:
                 return
-            entry.gone_s = time.monotonic()
-            if topic == DRIVE and topic in self._commands:
+            imported.gone_s = time.monotonic()
+            if imported.topic == DRIVE and DRIVE in self._commands:
                 # Stop immediately instead of after the arbiter's timeout.
                 released = self._driver.removesuffix(RELEASED) + RELEASED
-                entry.publisher.publish(twist_stamped(0.0, 0.0, time.time_ns(), released))
+                imported.publisher.publish(twist_stamped(0.0, 0.0, time.time_ns(), released))
 
     def reconcile(self) -> None:
-        """Drop topics whose publishers have been gone for a while."""
+        """Drop topics whose publishers have been gone for a while; commands stay."""
         now = time.monotonic()
-        for topic, entry in list(self._topics.items()):
-            if not entry.always and entry.gone_s is not None and now - entry.gone_s > GRACE_S:
-                self._shut(self._topics.pop(topic))
+        for topic, imported in list(self._topics.items()):
+            if topic not in self._commands and imported.gone_s is not None and now - imported.gone_s > GRACE_S:
+                del self._topics[topic]
+                imported.close()
+                self._count_before += imported.count
+                if topic not in EVERY_NODES:
+                    self._node.drop(imported.publisher)
                 self._node.diagnose(f"in {topic}", OK, "its publishers are gone")
-
-    def _shut(self, entry: _In) -> None:
-        if entry.subscription is not None:
-            entry.subscription.close()
-            self._count_before += entry.subscription.count
-        if not entry.own_publisher:
-            self._node.drop(entry.publisher)
-
-
-def topic_counts(outgoing: Outgoing, incoming: Incoming) -> tuple[str, int, dict[str, int]]:
-    """Return the traffic in both directions: text, number of lost messages, and values of the diagnosis."""
-    lost = incoming.lost()
-    text = (
-        f"{outgoing.count} messages out on {len(outgoing.topics)} topics, {incoming.count} in on {len(incoming.topics)}"
-    )
-    if lost:
-        text += f"; lost: {', '.join(f'{topic} {count}' for topic, count in sorted(lost.items()))}"
-    return text, sum(lost.values()), {"thinned": outgoing.thinned, "malformed": incoming.malformed()}

@@ -2,36 +2,68 @@
 
 from __future__ import annotations
 
+import fnmatch
+import math
 import os
-import threading
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from instant_ic.bridge.zenoh_format import GID_SIZE, SENDER_SIZE, Attachment, TopicQoS, data_key
-from instant_ic.bridge.zenoh_session import RosNode, RosSession, ZenohError, zenoh
-from instant_ic.bridge.zenoh_topics import GRACE_S, Namespace, known_hash, parse_publish, ros_qos, takes
+from instant_ic.bridge.zenoh_format import GID_SIZE, SENDER_SIZE, Attachment, data_key
+from instant_ic.bridge.zenoh_session import RosNode, zenoh
 from instant_ic.bus import ERROR, RELIABLE, Node, QoS, Subscription
 from instant_ic.bus.qos import PRESETS
 from instant_ic.bus.registry import PublisherInfo, TopicInfo
 from instant_ic.bus.transport import Received
+from instant_ic.msg import MessageError, message_type, type_hash
+
+GRACE_S = 3.0
+"""Time in seconds that a vanished topic is kept, for example while its node restarts."""
 
 _HEARTBEAT_S = 0.5  # lets a late reader of a latched topic, or one with losses, find what it missed, as in rmw_zenoh
 
 
+def known_hash(type_name: str) -> str | None:
+    """Return the RIHS01 hash of a type; None if the type is neither in ROS 2 Jazzy nor ours."""
+    try:
+        return type_hash(message_type(type_name).__msgtype__)
+    except MessageError:
+        return None
+
+
+def parse_publish(entries: Sequence[str]) -> dict[str, int]:
+    """Parse lines such as ``/lidar/points rate_hz=3``; return pattern → shortest period in ns (0: no limit).
+
+    Raises:
+        ValueError: a line has another form.
+    """
+    periods = {}
+    for entry in entries:
+        pattern, _, option = entry.partition(" ")
+        key, _, value = option.strip().partition("=")
+        try:
+            rate_hz = float(value) if option else math.inf
+        except ValueError:
+            rate_hz = 0.0
+        if not pattern.startswith("/") or (option and key != "rate_hz") or not rate_hz > 0:
+            raise ValueError(f"publish: {entry!r} must be /TOPIC or a pattern, optionally followed by rate_hz=N")
+        periods[pattern] = int(1e9 / rate_hz)
+    return periods
+
+
 class RosPublisher:
-    """A publisher in the ROS graph; :meth:`put` may be called from any thread.
+    """A publisher in the ROS graph.
 
     Args:
         node: node of the publisher.
         topic: full name, including the namespace.
         type_name: ``std_msgs/msg/String``.
         type_hash: RIHS01 hash of the type.
-        qos: quality of service; a latched topic keeps its last ``depth`` messages for late subscribers.
+        qos: preset; a latched topic keeps its last message for late subscribers.
     """
 
-    def __init__(self, node: RosNode, topic: str, type_name: str, type_hash: str, qos: TopicQoS) -> None:
+    def __init__(self, node: RosNode, topic: str, type_name: str, type_hash: str, qos: QoS = RELIABLE) -> None:
         package = zenoh()
         session = node.session
         key = data_key(session.domain, topic, type_name, type_hash)
@@ -42,7 +74,7 @@ class RosPublisher:
             self._publisher = package.ext.declare_advanced_publisher(
                 session.zenoh,
                 key,
-                cache=package.ext.CacheConfig(max_samples=qos.depth or 1),
+                cache=package.ext.CacheConfig(max_samples=1),
                 publisher_detection=True,
                 sample_miss_detection=package.ext.MissDetectionConfig(heartbeat=None, sporadic_heartbeat=_HEARTBEAT_S),
                 **options,
@@ -50,23 +82,13 @@ class RosPublisher:
         else:
             self._publisher = session.zenoh.declare_publisher(key, **options)
         self._token = node.endpoint("MP", topic, type_name, type_hash, qos)
-        self._lock = threading.Lock()
         self.gid = session.gid_head + os.urandom(GID_SIZE - SENDER_SIZE)
-        self.count = 0
+        self._count = 0
 
     def put(self, payload: bytes | memoryview, source_ns: int) -> None:
-        """Send CDR bytes unchanged, with their time of publication.
-
-        Raises:
-            ZenohError: the session is closed.
-        """
-        with self._lock:
-            self.count += 1
-            attachment = Attachment(self.count, source_ns, self.gid).pack()
-            try:
-                self._publisher.put(bytes(payload), attachment=attachment)
-            except zenoh().ZError as error:
-                raise ZenohError(f"Zenoh: {error}") from None
+        """Send CDR bytes unchanged, with their time of publication."""
+        self._count += 1
+        self._publisher.put(bytes(payload), attachment=Attachment(self._count, source_ns, self.gid).pack())
 
     def close(self) -> None:
         self._token.undeclare()
@@ -74,14 +96,29 @@ class RosPublisher:
 
 
 @dataclass
-class _Out:
-    """An exported topic: one subscription on the bus, and one ROS publisher for each of its publishers."""
+class _Mirror:
+    """A bus publisher in the ROS graph."""
+
+    ros: RosPublisher
+    gone_s: float | None = None
+    due_ns: int = 0
+
+    def early(self, now_ns: int, period_ns: int) -> bool:
+        """Return whether a rate limit drops a message that arrives now."""
+        if now_ns < self.due_ns:
+            return True
+        # Keep a fixed grid of periods, so that a limit of 3 Hz on a 10 Hz topic gives 3 Hz; no burst after a pause.
+        self.due_ns = (self.due_ns if now_ns - self.due_ns < period_ns else now_ns) + period_ns
+        return False
+
+
+@dataclass
+class _Exported:
+    """An exported topic: one subscription on the bus, and a mirror of each of its publishers by node name."""
 
     period_ns: int
-    subscription: Subscription | None = None
-    publishers: dict[str, RosPublisher] = field(default_factory=dict)
-    gone_s: dict[str, float] = field(default_factory=dict)
-    due_ns: dict[str, int] = field(default_factory=dict)
+    subscription: Subscription
+    mirrors: dict[str, _Mirror] = field(default_factory=dict)
 
 
 class Outgoing:
@@ -91,30 +128,26 @@ class Outgoing:
     all kept for late subscribers, and ``ros2 node list`` shows the nodes themselves.
 
     Args:
-        session: the Zenoh session.
-        namespace: namespace of the topics in the ROS graph.
-        own: the gateway itself in the ROS graph.
+        node: the gateway.
+        own: the gateway in the ROS graph.
+        prefix: put before the names of topics: ``/robot1``, or empty.
         publish: see :func:`parse_publish`; the first matching pattern applies.
+        imported: returns whether the gateway imports a topic; messages that it imported are not exported again.
 
     Attributes:
-        brought_in: returns whether the same gateway imports a topic; messages that it imported are not exported again.
         count, thinned: messages sent, and messages dropped by a rate limit.
-
-    Raises:
-        ValueError: a line of ``publish`` is wrong.
     """
 
     def __init__(
-        self, node: Node[Any], session: RosSession, namespace: Namespace, own: RosNode, publish: Sequence[str]
+        self, node: Node[Any], own: RosNode, prefix: str, publish: Sequence[str], imported: Callable[[str], bool]
     ) -> None:
         self._node = node
-        self._session = session
         self._own = own
-        self._namespace = namespace
+        self._prefix = prefix
         self._periods = parse_publish(publish)
-        self._topics: dict[str, _Out] = {}
+        self._imported = imported
+        self._topics: dict[str, _Exported] = {}
         self._nodes: dict[str, RosNode] = {}
-        self.brought_in: Callable[[str], bool] = lambda topic: False
         self.count = 0
         self.thinned = 0
 
@@ -124,77 +157,68 @@ class Outgoing:
 
     def reconcile(self, present: Sequence[TopicInfo]) -> None:
         """Export new topics, and drop those whose publishers have been gone for a while."""
-        now = time.monotonic()
         live: dict[str, list[PublisherInfo]] = {}
         for info in present:
             publishers = [p for p in info.publishers if not self._came_in(info.topic, p.node)]
-            if publishers and takes(tuple(self._periods), info.topic):
-                live[info.topic] = publishers
-        for topic, publishers in live.items():
-            if (out := self._topics.get(topic)) is None:
-                period = next(p for pattern, p in self._periods.items() if takes((pattern,), topic))
-                out = self._topics[topic] = _Out(period)
-            for publisher in publishers:
-                self._mirror(topic, publisher.node, publisher.type_name, PRESETS.get(publisher.qos, RELIABLE))
-            if out.subscription is None:
+            period_ns = next((p for each, p in self._periods.items() if fnmatch.fnmatchcase(info.topic, each)), None)
+            if not publishers or period_ns is None:
+                continue
+            live[info.topic] = publishers
+            if info.topic not in self._topics:
                 qos = max((PRESETS.get(p.qos, RELIABLE) for p in publishers), key=lambda q: (q.latched, q.reliable))
-                out.subscription = self._node.subscribe_received(topic, self._forward, qos)
-        for topic, out in list(self._topics.items()):
-            here = {publisher.node for publisher in live.get(topic, ())}
-            for name in [name for name in out.publishers if name not in here]:
-                if now - out.gone_s.setdefault(name, now) > GRACE_S:
-                    out.publishers.pop(name).close()
-                    del out.gone_s[name]
-            for name in here:
-                out.gone_s.pop(name, None)
-            if not out.publishers:
-                if out.subscription is not None:
-                    self._node.drop(out.subscription)
-                del self._topics[topic]
-        used = {name for out in self._topics.values() for name in out.publishers}
-        for name in [name for name in self._nodes if name not in used]:
+                subscription = self._node.subscribe_received(info.topic, self._forward, qos)
+                self._topics[info.topic] = _Exported(period_ns, subscription)
+            for publisher in publishers:
+                self._mirror(info.topic, publisher.node, publisher.type_name, PRESETS.get(publisher.qos, RELIABLE))
+        for topic in list(self._topics):
+            self._drop_gone(topic, {publisher.node for publisher in live.get(topic, ())})
+        used = {name for exported in self._topics.values() for name in exported.mirrors}
+        for name in self._nodes.keys() - used:
             self._nodes.pop(name).close()
 
-    def _mirror(self, topic: str, node: str, type_name: str, qos: QoS) -> RosPublisher | None:
-        """Return the ROS publisher that represents a node's publisher; create it if needed."""
-        out = self._topics[topic]
-        if node not in out.publishers:
+    def _drop_gone(self, topic: str, here: set[str]) -> None:
+        """Drop the mirrors of a topic's publishers that have been gone for a while, and the topic with the last one."""
+        exported, now = self._topics[topic], time.monotonic()
+        for name, mirror in list(exported.mirrors.items()):
+            if name in here:
+                mirror.gone_s = None
+            elif mirror.gone_s is None:
+                mirror.gone_s = now
+            elif now - mirror.gone_s > GRACE_S:
+                exported.mirrors.pop(name).ros.close()
+        if not exported.mirrors and not here:
+            self._node.drop(exported.subscription)
+            del self._topics[topic]
+
+    def _mirror(self, topic: str, node: str, type_name: str, qos: QoS) -> _Mirror | None:
+        """Return the mirror of a node's publisher; create it if needed. Return None if its type is unknown."""
+        mirrors = self._topics[topic].mirrors
+        if node not in mirrors:
             if (hash_ := known_hash(type_name)) is None:
                 self._node.diagnose(f"out {topic}", ERROR, f"{type_name} is unknown here: not exported")
                 return None
-            there = self._own if node == self._own.name else self._nodes.get(node)
+            own = self._own
+            there = own if node == self._node.node_name else self._nodes.get(node)
             if there is None:
-                there = self._nodes[node] = RosNode(self._session, self._namespace.ros, node)
-            name = self._namespace.to_ros(topic)
-            out.publishers[node] = RosPublisher(there, name, type_name, hash_, ros_qos(qos))
-            self._node.log.debug("%s of %s is exported as %s", topic, node, name)
-        return out.publishers[node]
+                there = self._nodes[node] = RosNode(own.session, own.namespace, node)
+            mirrors[node] = _Mirror(RosPublisher(there, self._prefix + topic, type_name, hash_, qos))
+            self._node.log.debug("%s of %s is exported as %s", topic, node, self._prefix + topic)
+        return mirrors[node]
 
     def _came_in(self, topic: str, publisher: str) -> bool:
         """Return whether a publisher only republishes imported messages, which must not be exported again."""
-        return publisher == self._node.node_name and self.brought_in(topic)
+        return publisher == self._node.node_name and self._imported(topic)
 
     def _forward(self, received: Received) -> None:
-        out = self._topics.get(received.topic)
-        if out is None or self._came_in(received.topic, received.publisher):
+        exported = self._topics.get(received.topic)
+        if exported is None or self._came_in(received.topic, received.publisher):
             return
-        publisher = out.publishers.get(received.publisher)
-        if publisher is None and out.subscription is not None:  # received before the next look at the registry
-            publisher = self._mirror(received.topic, received.publisher, received.type_name, out.subscription.raw.qos)
-        if publisher is None or self._early(out, received):
+        # A message may come before the next look at the registry.
+        mirror = self._mirror(received.topic, received.publisher, received.type_name, exported.subscription.raw.qos)
+        if mirror is None:
             return
-        publisher.put(received.payload, received.publish_ns)
-        self.count += 1
-
-    def _early(self, out: _Out, received: Received) -> bool:
-        """Return True if the rate limit drops a message; each publisher has its own limit."""
-        if not out.period_ns:
-            return False
-        due_ns = out.due_ns.get(received.publisher, 0)
-        if received.received_ns < due_ns:
+        if exported.period_ns and mirror.early(received.received_ns, exported.period_ns):
             self.thinned += 1
-            return True
-        # Keep a fixed grid of periods, so that a limit of 3 Hz on a 10 Hz topic gives 3 Hz; no burst after a pause.
-        start_ns = due_ns if received.received_ns - due_ns < out.period_ns else received.received_ns
-        out.due_ns[received.publisher] = start_ns + out.period_ns
-        return False
+            return
+        mirror.ros.put(received.payload, received.publish_ns)
+        self.count += 1

@@ -1,6 +1,6 @@
-"""A Zenoh session that provides our topics as ROS 2 nodes, publishers and subscriptions, as rmw_zenoh does.
+"""A Zenoh session whose nodes appear in the ROS graph, as those of rmw_zenoh do.
 
-Independent of our bus: bytes in, bytes out. Zenoh is an extra, imported when a session is opened.
+Zenoh is an extra, imported when a session is opened.
 """
 
 from __future__ import annotations
@@ -9,27 +9,19 @@ import itertools
 import json
 import logging
 import os
-import queue
 import re
-import threading
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from instant_ic.bridge.zenoh_format import (
-    ADMIN_SPACE,
-    SENDER_SIZE,
-    FormatError,
-    Kind,
-    Token,
-    TopicQoS,
-)
+from instant_ic.bridge.zenoh_format import ADMIN_SPACE, SENDER_SIZE, FormatError, Kind, Token
 from instant_ic.util.closing import Closing
 from instant_ic.util.paths import shipped_file
 
 DEFAULT_ROUTER = "tcp/localhost:7447"
 
-_OPEN_S = 10.0
+CONNECT_TIMEOUT_MS = 2000
+"""Time after which a client whose router does not answer gives up; by its own configuration it may wait forever."""
 
 SESSION_DEFAULTS = {
     "mode": '"peer"',
@@ -73,20 +65,8 @@ def zenoh() -> Any:
     return zenoh
 
 
-def config_path(name: str) -> Path | None:
-    """Return a configuration file by path, or by name among the files of config/; None for an empty name.
-
-    Raises:
-        FileNotFoundError: there is no such file in either place.
-    """
-    if not name:
-        return None
-    path = Path(name).expanduser()
-    return path if path.is_file() or "/" in name else shipped_file("config", name)
-
-
 def load_config(
-    path: Path | None,
+    file: str,
     connect: Sequence[str] = (),
     listen: Sequence[str] = (),
     defaults: Mapping[str, str] = SESSION_DEFAULTS,
@@ -94,38 +74,34 @@ def load_config(
     """Load a Zenoh configuration.
 
     Args:
-        path: a Zenoh JSON5 file, used unchanged; None uses ``defaults``.
+        file: path of a Zenoh JSON5 file, or its name in config/; empty uses ``defaults``.
         connect: endpoints to connect to (``tcp/10.0.0.1:7447``), instead of those of the file.
         listen: endpoints to listen on, instead of those of the file.
         defaults: Zenoh configuration keys → JSON5 values.
 
     Raises:
-        ZenohError: the file cannot be read or is not a Zenoh configuration, or an endpoint is invalid.
+        ZenohError: the file does not exist or is not a Zenoh configuration, or an endpoint is invalid.
     """
     package = zenoh()
+    what = file
+    given = {"connect/endpoints": connect, "listen/endpoints": listen}
+    settings = {} if file else dict(defaults)
+    settings |= {key: json.dumps(list(endpoints)) for key, endpoints in given.items() if endpoints}
     try:
-        if path is not None:
-            config = package.Config.from_json5(path.read_text())
-        else:
-            config = package.Config()
-            for key, value in defaults.items():
-                config.insert_json5(key, value)
+        config = package.Config.from_json5(_path(file).read_text()) if file else package.Config()
+        for key, value in settings.items():
+            what = f"{key} {value}"
+            config.insert_json5(key, value)
     except OSError as error:
-        raise ZenohError(f"{path}: cannot be read: {error.strerror}") from None
+        raise ZenohError(f"session file: {error}") from None
     except package.ZError as error:
-        raise ZenohError(f"{path or 'defaults'}: not a Zenoh configuration: {_words(error)}") from None
-    for key, endpoints in (("connect/endpoints", connect), ("listen/endpoints", listen)):
-        if endpoints:
-            try:
-                config.insert_json5(key, json.dumps(list(endpoints)))
-            except package.ZError as error:
-                raise ZenohError(f"{key} {list(endpoints)}: {_words(error)}") from None
+        raise ZenohError(f"{what}: not a Zenoh configuration: {_text(error)}") from None
     return config
 
 
-def is_client(config: Any) -> bool:
-    """Return whether the configuration is a client's; a client cannot open before its router runs."""
-    return bool(json.loads(config.get_json("mode")) == "client")
+def _path(file: str) -> Path:
+    path = Path(file).expanduser()
+    return path if path.is_file() or "/" in file else shipped_file("config", file)
 
 
 def open_zenoh(config: Any) -> Any:
@@ -136,34 +112,15 @@ def open_zenoh(config: Any) -> Any:
     """
     package = zenoh()
     package.init_log_from_env_or("error")
-    opened: queue.SimpleQueue[Any] = queue.SimpleQueue()
-    given_up = threading.Event()
-
-    def work() -> None:
-        try:
-            session = package.open(config)
-        except package.ZError as error:
-            opened.put(error)
-            return
-        opened.put(session)
-        if given_up.is_set():
-            session.close()
-
-    # Depending on its configuration, Zenoh may wait forever.
-    threading.Thread(target=work, name="zenoh open", daemon=True).start()
+    if json.loads(config.get_json("mode")) == "client":
+        config.insert_json5("connect/timeout_ms", str(CONNECT_TIMEOUT_MS))
     try:
-        session = opened.get(timeout=_OPEN_S)
-    except queue.Empty:
-        given_up.set()
-        raise ZenohError(
-            f"Zenoh session: not open after {_OPEN_S:g} s; a client waits for its router: is it running?"
-        ) from None
-    if isinstance(session, package.ZError):
-        raise ZenohError(f"Zenoh session: {_words(session)}")
-    return session
+        return package.open(config)
+    except package.ZError as error:
+        raise ZenohError(f"Zenoh session: {_text(error)}") from None
 
 
-def _words(error: Exception) -> str:
+def _text(error: Exception) -> str:
     """Return the text of a Zenoh error without source locations."""
     return re.sub(r"\s+at /\S+\.rs:\d+\.?", "", str(error)).strip()
 
@@ -184,7 +141,7 @@ class RosSession(Closing):
         self.zenoh = open_zenoh(config)
         self.id = str(self.zenoh.info.zid())
         self.gid_head = os.urandom(SENDER_SIZE)
-        self._ids = itertools.count()
+        self.entity_ids = itertools.count()
         self._watch: Any = None
 
     def close(self) -> None:
@@ -192,19 +149,13 @@ class RosSession(Closing):
         if not self.zenoh.is_closed():
             self.zenoh.close()
 
-    def routers(self) -> list[str]:
-        return [str(zid) for zid in self.zenoh.info.routers_zid()]
+    def routers(self) -> int:
+        """Return the number of connected routers."""
+        return len(self.zenoh.info.routers_zid())
 
-    def peers(self) -> list[str]:
-        return [str(zid) for zid in self.zenoh.info.peers_zid()]
-
-    def token(self, kind: Kind, node: RosNode | None, namespace: str, name: str, *endpoint: Any) -> tuple[Token, Any]:
-        """Create the token of a new entity; return it with its declaration."""
-        entity = next(self._ids)
-        token = Token(
-            kind, self.domain, self.id, entity if node is None else node.id, entity, namespace, name, *endpoint
-        )
-        return token, self.zenoh.liveliness().declare_token(token.key())
+    def peers(self) -> int:
+        """Return the number of connected peers."""
+        return len(self.zenoh.info.peers_zid())
 
     def watch(self, on_token: Callable[[Token, bool], None]) -> None:
         """Call ``on_token(token, alive)`` for current and future entities of other sessions, on a Zenoh thread."""
@@ -228,18 +179,23 @@ class RosNode:
     Args:
         session: session of the node.
         namespace: ``/robot1``, or ``/``.
+        name: name of the node.
     """
 
     def __init__(self, session: RosSession, namespace: str, name: str) -> None:
         self.session = session
-        self.namespace = namespace
-        self.name = name
-        token, self._declaration = session.token("NN", None, namespace, name)
-        self.id = token.node_id
+        self._id = next(session.entity_ids)
+        self.namespace, self.name = namespace, name
+        self._token = self._declare("NN", self._id)
 
-    def endpoint(self, kind: Kind, topic: str, type_name: str, type_hash: str, qos: TopicQoS) -> Any:
-        """Declare the token of one of the node's publishers or subscriptions."""
-        return self.session.token(kind, self, self.namespace, self.name, topic, type_name, type_hash, qos)[1]
+    def endpoint(self, kind: Kind, *endpoint: Any) -> Any:
+        """Declare the token of a publisher or subscription with its topic, type name, type hash and QoS."""
+        return self._declare(kind, next(self.session.entity_ids), *endpoint)
+
+    def _declare(self, kind: Kind, number: int, *endpoint: Any) -> Any:
+        session = self.session
+        token = Token(kind, session.domain, session.id, self._id, number, self.namespace, self.name, *endpoint)
+        return session.zenoh.liveliness().declare_token(token.key())
 
     def close(self) -> None:
-        self._declaration.undeclare()
+        self._token.undeclare()

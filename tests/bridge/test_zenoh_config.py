@@ -9,7 +9,6 @@ from pathlib import Path
 import pytest
 from live_nodes import LiveNode, Neighbour, wait_for
 
-from instant_ic.bridge.zenoh_format import TopicQoS
 from instant_ic.bridge.zenoh_outgoing import RosPublisher
 from instant_ic.bridge.zenoh_security import beyond_loopback, insecurity
 from instant_ic.bridge.zenoh_session import (
@@ -45,7 +44,7 @@ def with_tls(name: str) -> str:
 
 @pytest.mark.parametrize("name", FILES)
 def test_shipped_files_are_zenoh_configurations_with_and_without_tls(name):
-    plain = load_config(paths.shipped_file("config", name))
+    plain = load_config(name)
     secure = zenoh.Config.from_json5(with_tls(name))
     for config in (plain, secure):
         assert config.get_json("scouting/multicast/enabled") == "false"
@@ -133,9 +132,9 @@ def test_any_other_session_may_not_and_the_reason_names_the_setting(config, word
 
 def test_the_shipped_files_without_tls_and_the_defaults_may_not():
     for name in ("zenoh_robot.json5", "zenoh_station.json5"):
-        assert insecurity(load_config(paths.shipped_file("config", name)))
+        assert insecurity(load_config(name))
     for defaults in (CLIENT_DEFAULTS, SESSION_DEFAULTS):
-        assert insecurity(load_config(None, ("tls/r.example:7447",), defaults=defaults))
+        assert insecurity(load_config("", ("tls/r.example:7447",), defaults=defaults))
 
 
 @pytest.mark.parametrize(
@@ -152,8 +151,8 @@ def test_the_shipped_files_without_tls_and_the_defaults_may_not():
     ],
 )
 def test_only_a_session_that_stays_within_the_machine_may_do_without(endpoint, stays):
-    assert (beyond_loopback(load_config(None, (endpoint,), defaults=CLIENT_DEFAULTS)) == "") is stays
-    assert beyond_loopback(load_config(None, (endpoint,), defaults=SESSION_DEFAULTS))  # a peer: its router names others
+    assert (beyond_loopback(load_config("", (endpoint,), defaults=CLIENT_DEFAULTS)) == "") is stays
+    assert beyond_loopback(load_config("", (endpoint,), defaults=SESSION_DEFAULTS))  # a peer: its router names others
 
 
 def test_the_simulated_fleet_carries_commands_and_a_robot_that_is_started_alike_elsewhere_does_not():
@@ -237,9 +236,9 @@ def test_access_control_lets_a_robot_into_its_own_namespace_and_a_station_everyw
     hash_ = type_hash(STRING)
     for topic in ("robot1/x", "robot2/x"):
         station.zenoh.declare_subscriber(f"0/{topic}/**", lambda s: heard.append(str(s.key_expr)))
-    own = RosPublisher(RosNode(robot, "/robot1", "node"), "/robot1/x", STRING, hash_, TopicQoS())
-    foreign = RosPublisher(RosNode(robot, "/robot2", "spoof"), "/robot2/x", STRING, hash_, TopicQoS())
-    stranger = RosPublisher(RosNode(other, "/robot2", "node"), "/robot2/x", STRING, hash_, TopicQoS())
+    own = RosPublisher(RosNode(robot, "/robot1", "node"), "/robot1/x", STRING, hash_)
+    foreign = RosPublisher(RosNode(robot, "/robot2", "spoof"), "/robot2/x", STRING, hash_)
+    stranger = RosPublisher(RosNode(other, "/robot2", "node"), "/robot2/x", STRING, hash_)
     put_until(own, lambda: heard, "robot1's message at the station")
     for _ in range(20):
         foreign.put(b"x", 1)
@@ -251,14 +250,13 @@ def test_access_control_lets_a_robot_into_its_own_namespace_and_a_station_everyw
     # Commands: the station reaches the robot.
     back = []
     robot.zenoh.declare_subscriber("0/robot1/operator/**", back.append)
-    command = RosPublisher(RosNode(station, "/robot1", "console"), "/robot1/operator/x", STRING, hash_, TopicQoS())
+    command = RosPublisher(RosNode(station, "/robot1", "console"), "/robot1/operator/x", STRING, hash_)
     put_until(command, lambda: back, "the station's command at the robot")
 
 
 def test_latched_values_reach_late_stations_through_access_control(secure, certificates, tmp_path_factory):
     robot = secure.session("robot", "robot1")
-    latched = TopicQoS(latched=True, depth=1)
-    publisher = RosPublisher(RosNode(robot, "/robot1", "slam"), "/robot1/map", STRING, type_hash(STRING), latched)
+    publisher = RosPublisher(RosNode(robot, "/robot1", "slam"), "/robot1/map", STRING, type_hash(STRING), LATCHED)
     publisher.put(bytes(serialize(String("the map"))), time.time_ns())
     wait_for(robot.routers, "the router")
     text = with_tls("zenoh_station.json5").replace("/etc/zenoh", str(certificates))
@@ -286,7 +284,7 @@ def test_commands_come_in_over_tls_with_certificates(secure, certificates, tmp_p
     driven = listener.listen("/operator/cmd_vel")
     name = "geometry_msgs/msg/TwistStamped"
     station = RosNode(secure.session("station", "station"), "/robot1", "console")
-    drive = RosPublisher(station, "/robot1/operator/cmd_vel", name, type_hash(name), TopicQoS())
+    drive = RosPublisher(station, "/robot1/operator/cmd_vel", name, type_hash(name))
 
     def command():
         drive.put(bytes(serialize(twist_stamped(0.1, 0.0, time.time_ns()))), time.time_ns())

@@ -5,14 +5,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from instant_ic.bridge.zenoh_format import (
+    QOS_TEXT,
     Attachment,
     FormatError,
     Token,
-    TopicQoS,
+    closest_qos,
     data_key,
     dds_type,
     ros_type,
 )
+from instant_ic.bus import LATCHED, RELIABLE, SENSOR
 from instant_ic.msg import type_hash
 
 zenoh = pytest.importorskip("zenoh")
@@ -33,11 +35,11 @@ def test_tokens_of_the_documented_examples():
     assert Token.parse(node) == Token("NN", 0, "aac3178e146ba6f1fc6e6a4085e77f21", 0, 0, "/", "listener")
     publisher = (
         "@ros2_lv/0/8b20917502ee955ac4476e0266340d5c/0/10/MP/%/%/talker/%chatter/std_msgs::msg::dds_::String_/"
-        f"{STRING_HASH}/::,7:,:,:,,"
+        f"{STRING_HASH}/::,10:,:,:,,"
     )
     token = Token(
         *("MP", 0, "8b20917502ee955ac4476e0266340d5c", 0, 10, "/", "talker"),
-        *("/chatter", "std_msgs/msg/String", STRING_HASH, TopicQoS(depth=7)),
+        *("/chatter", "std_msgs/msg/String", STRING_HASH, RELIABLE),
     )
     assert token.key() == publisher
     assert Token.parse(publisher) == token
@@ -48,16 +50,16 @@ def test_tokens_of_the_documented_examples():
 @pytest.mark.parametrize(
     ("qos", "text"),
     [
-        (TopicQoS(), "::,:,:,:,,"),  # RELIABLE, VOLATILE, KEEP_LAST 42: all default
-        (TopicQoS(depth=7), "::,7:,:,:,,"),
-        (TopicQoS(reliable=False, depth=5), "2::,5:,:,:,,"),
-        (TopicQoS(latched=True, depth=1), ":1:,1:,:,:,,"),
-        (TopicQoS(depth=0), "::2,:,:,:,,"),  # KEEP_ALL
+        (RELIABLE, "::,:,:,:,,"),  # RELIABLE, VOLATILE, KEEP_LAST 42: all default
+        (RELIABLE, "::2,:,:,:,,"),  # KEEP_ALL
+        (SENSOR, "2::,100:,:,:,,"),
+        (LATCHED, ":1:,5:,:,:,,"),
+        (LATCHED, "2:1:,5:,:,:,,"),
     ],
 )
-def test_quality_of_service_part(qos, text):
-    assert qos.encode() == text
-    assert TopicQoS.decode(text) == qos
+def test_any_quality_of_service_is_the_closest_preset(qos, text):
+    assert closest_qos(text) == qos
+    assert closest_qos(QOS_TEXT[qos]) == qos
 
 
 @given(I64, I64, st.binary(min_size=16, max_size=16))
@@ -86,7 +88,7 @@ def test_any_bytes_are_an_attachment_or_a_clear_error(data):
     st.one_of(st.just("/"), TOPICS),
     NAMES,
     TOPICS,
-    st.builds(TopicQoS, st.booleans(), st.booleans(), st.integers(0, 5000)),
+    st.sampled_from([SENSOR, RELIABLE, LATCHED]),
 )
 def test_endpoint_token_is_what_the_independent_client_makes_and_comes_back(
     kind, domain, number, namespace, node, topic, qos
@@ -101,17 +103,15 @@ def test_endpoint_token_is_what_the_independent_client_makes_and_comes_back(
     )
     other = NodeEntity(domain, "ab12", number, node, namespace)
     theirs = EndpointEntity(
-        other, number + 1, EntityKind(kind), topic, dds_type("std_msgs/msg/Bool"), STRING_HASH, qos.encode()
+        other, number + 1, EntityKind(kind), topic, dds_type("std_msgs/msg/Bool"), STRING_HASH, QOS_TEXT[qos]
     )
     assert token.key() == endpoint_liveliness_keyexpr(theirs)
     assert Token.parse(token.key()) == token
     assert Token("NN", domain, "ab12", number, number, namespace, node).key() == node_liveliness_keyexpr(other)
     assert _parse_liveliness_keyexpr(token.key())["qualified_name"] == topic
-    decoded = sdk_qos.QosProfile.decode(qos.encode())
+    decoded = sdk_qos.QosProfile.decode(QOS_TEXT[qos])
     assert (decoded.reliability.name == "RELIABLE") == qos.reliable
     assert (decoded.durability.name == "TRANSIENT_LOCAL") == qos.latched
-    if qos.depth not in (0, 42):  # the client's own default depth is 10, rmw_zenoh's is 42
-        assert decoded.history_depth == qos.depth
 
 
 @given(st.text(max_size=80))

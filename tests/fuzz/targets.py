@@ -492,11 +492,11 @@ def _bridge_frames() -> Target:
 
 @target("zenoh", 1500)
 def _zenoh() -> Target:
-    from instant_ic.bridge.zenoh_format import Attachment, FormatError, Token, TopicQoS
+    from instant_ic.bridge.zenoh_format import Attachment, FormatError, Token, closest_qos
 
     def parse(data: bytes) -> None:
         text = data.decode("latin-1")
-        for read in (lambda: Attachment.unpack(data), lambda: TopicQoS.decode(text), lambda: Token.parse(text)):
+        for read in (lambda: Attachment.unpack(data), lambda: closest_qos(text), lambda: Token.parse(text)):
             try:
                 read()
             except FormatError:
