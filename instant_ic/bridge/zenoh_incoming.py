@@ -50,7 +50,7 @@ def check_subscribe(entries: Sequence[str]) -> None:
             raise ValueError(f"subscribe: {topic} moves a robot; list it under commands, or rename it there")
 
 
-class _Imported:
+class _ImportedTopic:
     """An imported topic: a subscription in the ROS graph and a publisher on the bus.
 
     It receives only from other sessions, so our own messages do not return. Messages of another definition have another
@@ -82,7 +82,7 @@ class _Imported:
         type_name: str,
         qos: QoS,
         publisher: Publisher,
-        on_message: Callable[[_Imported, bytes, Attachment], None],
+        on_message: Callable[[_ImportedTopic, bytes, Attachment], None],
     ) -> None:
         self.topic = topic
         self.type_name = type_name
@@ -176,7 +176,7 @@ class Incoming:
         self._no_commands = no_commands
         self._gate = gate
         self._gate_lock = threading.Lock()  # each subscription calls on its own thread
-        self._topics: dict[str, _Imported] = {}
+        self._topics: dict[str, _ImportedTopic] = {}
         self._refusing: set[str] = set()
         self._driver = ""  # sender of the newest drive command, as the arbiter knows it
         self._count_before = 0
@@ -244,25 +244,25 @@ class Incoming:
         imported.sources.add(source)
         imported.gone_s = None
 
-    def _open(self, topic: str, type_name: str, qos: QoS) -> _Imported:
+    def _open(self, topic: str, type_name: str, qos: QoS) -> _ImportedTopic:
         name = message_type(type_name).__msgtype__
         # The gateway itself publishes /heartbeat and the like; other nodes' messages share that publisher.
         publisher = next((p for p in self._node.publishers if p.topic == topic), None)
         if publisher is None:
             publisher = self._node.publisher_raw(topic, name, qos)
         handle = self._command if topic in self._commands else self._plain
-        imported = _Imported(self._own, topic, self._prefix, name, qos, publisher, handle)
+        imported = _ImportedTopic(self._own, topic, self._prefix, name, qos, publisher, handle)
         self._topics[topic] = imported
         self._node.log.debug("%s is imported as %s", self._prefix + topic, topic)
         return imported
 
-    def _plain(self, imported: _Imported, payload: bytes, attachment: Attachment) -> None:
+    def _plain(self, imported: _ImportedTopic, payload: bytes, attachment: Attachment) -> None:
         try:
             imported.publisher.publish_bytes(imported.merge(payload), attachment.source_ns)
         except MessageError as error:
             self._report(imported.topic, ERROR, f"refused: {error}")
 
-    def _command(self, imported: _Imported, payload: bytes, attachment: Attachment) -> None:
+    def _command(self, imported: _ImportedTopic, payload: bytes, attachment: Attachment) -> None:
         topic = imported.topic
         with self._gate_lock:
             passed = self._check(imported, payload, attachment)
@@ -275,7 +275,7 @@ class Incoming:
                 self._report(topic, OK, "commands are accepted")
             imported.publisher.publish_bytes(passed, attachment.source_ns)
 
-    def _check(self, imported: _Imported, payload: bytes, attachment: Attachment) -> bytes | memoryview | Refusal:
+    def _check(self, imported: _ImportedTopic, payload: bytes, attachment: Attachment) -> bytes | memoryview | Refusal:
         """Return the command to publish, or why not; a drive command names its sender, whatever that claims to be."""
         gate, age_s, steady_ns = self._gate, (time.time_ns() - attachment.source_ns) / 1e9, time.monotonic_ns()
         try:
@@ -299,7 +299,7 @@ class Incoming:
     def _report(self, topic: str, level: int, text: str) -> None:
         self._node.call_soon(self._node.diagnose, f"in {topic}", level, text)
 
-    def _left(self, imported: _Imported, source: tuple[str, int]) -> None:
+    def _left(self, imported: _ImportedTopic, source: tuple[str, int]) -> None:
         """Handle a ROS publisher that is gone; if it was the last driver, stop the robot."""
         with self._gate_lock:  # its command in transit must not follow the zero
             imported.sources.remove(source)

@@ -113,7 +113,7 @@ class _Mirror:
 
 
 @dataclass
-class _Exported:
+class _ExportedTopic:
     """An exported topic: one subscription on the bus, and a mirror of each of its publishers by node name."""
 
     period_ns: int
@@ -146,7 +146,7 @@ class Outgoing:
         self._prefix = prefix
         self._periods = parse_publish(publish)
         self._imported = imported
-        self._topics: dict[str, _Exported] = {}
+        self._topics: dict[str, _ExportedTopic] = {}
         self._nodes: dict[str, RosNode] = {}
         self.count = 0
         self.thinned = 0
@@ -167,7 +167,7 @@ class Outgoing:
             if info.topic not in self._topics:
                 qos = max((PRESETS.get(p.qos, RELIABLE) for p in publishers), key=lambda q: (q.latched, q.reliable))
                 subscription = self._node.subscribe_received(info.topic, self._forward, qos)
-                self._topics[info.topic] = _Exported(period_ns, subscription)
+                self._topics[info.topic] = _ExportedTopic(period_ns, subscription)
             for publisher in publishers:
                 self._mirror(info.topic, publisher.node, publisher.type_name, PRESETS.get(publisher.qos, RELIABLE))
         for topic in list(self._topics):
