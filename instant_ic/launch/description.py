@@ -33,10 +33,9 @@ class NodeSpec:
     """One node to start.
 
     Attributes:
-        name: name on the bus, unique in its run directory whatever its namespace.
+        name: name on the bus, unique in its run directory.
         exec: name of a shipped node, or the path of a program.
         command: the whole command line, without the run directory.
-        namespace: prefix of its topics.
         env: environment variables to add.
         respawn: restart it when it ends.
         respawn_delay_s: wait before the first restart; doubles with each further one within the window.
@@ -52,7 +51,6 @@ class NodeSpec:
     name: str
     exec: str
     command: tuple[str, ...]
-    namespace: str = ""
     env: Mapping[str, str] = field(default_factory=dict)
     respawn: bool = False
     respawn_delay_s: float = 1.0

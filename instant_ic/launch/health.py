@@ -77,22 +77,20 @@ class HealthMonitor:
         self._transports = {group: LocalTransport(path, name, time.time_ns) for group, path in self._folders.items()}
         for transport in self._transports.values():
             transport.patient = True
-        spaces = {(spec.group, spec.namespace.strip("/")): spec for spec in self._specs}
-        self._beats = [(spec.group, self._subscribe(spec, "/heartbeat", TYPE, RELIABLE)) for spec in spaces.values()]
+        self._beats = [(group, self._subscribe(group, "/heartbeat", TYPE, RELIABLE)) for group in self._folders]
         status = "instant_ic_msgs/msg/VspaceStatus"
         self._vspace = [
-            (_labelled(spec, "virtual space"), self._subscribe(spec, "/vspace/status", status, RELIABLE))
+            (_labelled(spec, "virtual space"), self._subscribe(spec.group, "/vspace/status", status, RELIABLE))
             for spec in self._running("nerf")
-            if not spec.namespace
         ]
         array = "diagnostic_msgs/msg/DiagnosticArray"
         self._diagnostics = {
             group: transport.advertise("/diagnostics", array, RELIABLE) for group, transport in self._transports.items()
         }
-        self._late = [self._subscribe(spec, LATE, "std_msgs/msg/Float32") for spec in self._running("simulator")]
+        self._late = [self._subscribe(spec.group, LATE, "std_msgs/msg/Float32") for spec in self._running("simulator")]
         control = "instant_ic_msgs/msg/ControlState"
         arbiters = self._running("arbiter") if self._late else []
-        self._control = [self._subscribe(spec, "/ic/state", control) for spec in arbiters]
+        self._control = [self._subscribe(spec.group, "/ic/state", control) for spec in arbiters]
         self._vspace_text: dict[str, str] = {}
         self._next_diagnostics_s = 0.0
         self._addresses: dict[str, str] = {}
@@ -103,10 +101,8 @@ class HealthMonitor:
     def _running(self, program: str) -> list[NodeSpec]:
         return [spec for spec in self._specs if spec.exec == program]
 
-    def _subscribe(self, spec: NodeSpec, topic: str, type_name: str, qos: QoS = SENSOR) -> RawSubscription:
-        namespace = spec.namespace.strip("/")
-        name = f"/{namespace}{topic}" if namespace else topic
-        return self._transports[spec.group].subscribe(name, type_name, qos, lambda: None)
+    def _subscribe(self, group: str, topic: str, type_name: str, qos: QoS = SENSOR) -> RawSubscription:
+        return self._transports[group].subscribe(topic, type_name, qos, lambda: None)
 
     def poll(self) -> None:
         """Process the messages that have arrived; never waits."""

@@ -22,12 +22,11 @@ from instant_ic.util import paths
 NODE_NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
 """Node names that the bus accepts."""
 
-_NAMESPACE = re.compile(r"/?\w+(/\w+)*/?")
 NODE_MAIN = Path(__file__).with_name("node_main.py")
 CONDITION = ("if", "unless")
 """Keys of entries that may be left out."""
 _NODE_KEYS = (
-    *("exec", "name", "namespace", "param", "remap", "env", *CONDITION),
+    *("exec", "name", "param", "remap", "env", *CONDITION),
     *("respawn", "respawn_delay", "required", "hang_timeout"),
 )
 
@@ -102,13 +101,10 @@ def read_node(body: YamlPlace, scope: Scope) -> NodeSpec | None:
     fields = body.fields(_NODE_KEYS, required=("exec",))
     executable = scope.text(fields["exec"])
     name = scope.text(fields.get("name")) or Path(executable).stem
-    namespace = scope.text(fields.get("namespace"))
     start = _program(fields["exec"], executable, scope.context)
     if not NODE_NAME.fullmatch(name):
         raise body.problem(f"node name {name!r} is not legal: letters, digits and underscores only")
-    if namespace and not _NAMESPACE.fullmatch(namespace):
-        raise fields["namespace"].problem(f"namespace {namespace!r} is not legal: names separated by / only")
-    options = ["--name", name, *(["--namespace", namespace] if namespace else []), *scope.options]
+    options = ["--name", name, *scope.options]
     places: dict[str, str] = {}
     for entry in fields["param"].items() if "param" in fields else []:
         options += _parameter(entry, scope, places)
@@ -116,7 +112,6 @@ def read_node(body: YamlPlace, scope: Scope) -> NodeSpec | None:
         options += ["-r", f"{source}:={target}"]
     spec = NodeSpec(
         name=name,
-        namespace=namespace,
         exec=executable,
         command=(*start, *options),
         env=dict(scope.pairs(fields.get("env"), "name", "value")),

@@ -57,7 +57,7 @@ def test_launch_in_a_process_ends_in_time_and_leaves_nothing(tmp_path, tmp_path_
         "- arg: {name: rate, default: 20.0, description: how often}\n"
         "- node: {exec: talker.py, name: first, param: [{name: rate_hz, value: $(var rate)}],"
         " remap: [{from: /scan, to: /one}]}\n"
-        "- node: {exec: talker.py, name: second, remap: [{from: /scan, to: /two}], namespace: side}\n"
+        "- node: {exec: talker.py, name: second, remap: [{from: /scan, to: /two}]}\n"
     )
     run_dir = tmp_path_factory.mktemp("r")  # short: sockets are bound in it
     command = [sys.executable, "-m", "instant_ic.cli.main", "launch", "two.yaml", "rate:=30", "--run-dir", str(run_dir)]
@@ -70,7 +70,7 @@ def test_launch_in_a_process_ends_in_time_and_leaves_nothing(tmp_path, tmp_path_
                 break
         nodes = {node.name: node for node in registry.list_nodes(run_dir)}
         assert nodes["first"].params["rate_hz"] == 30 and "/one" in nodes["first"].publishes
-        assert "/side/two" in nodes["second"].publishes
+        assert "/two" in nodes["second"].publishes
         began_s = time.monotonic()
         process.send_signal(signal.SIGINT)
         rest, _ = process.communicate(timeout=30)

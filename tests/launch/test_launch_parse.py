@@ -107,7 +107,6 @@ launch:
 - node:
     exec: talker.py
     name: t1
-    namespace: left
     param:
     - from: params.yaml
     - {name: port, value: $(var port)}
@@ -134,11 +133,11 @@ launch:
     node = description.nodes[0]
     params = ("--params-file", str(tmp_path / "params.yaml"))
     assert node.command[1:] == (
-        *(str(program), "--name", "t1", "--namespace", "left", *params, *params),
+        *(str(program), "--name", "t1", *params, *params),
         *("-p", "port:=80", "-p", "label:='80'", "-p", "quoted:='12'", "-p", "url:=http://host:80"),
         *("-p", "nothing:=''", "-p", "list:=[1, 80]", "-r", "/scan:=/other"),
     )
-    assert node.env == {"OMP_NUM_THREADS": "1"} and node.places["port:=80"].endswith("stack.yaml:14")
+    assert node.env == {"OMP_NUM_THREADS": "1"} and node.places["port:=80"].endswith("stack.yaml:13")
     assert (node.respawn, node.respawn_delay_s, node.required, node.hang_timeout_s) == (True, 2.5, True, 3.0)
     assert [(a.name, a.default, a.description) for a in read_arguments(file)] == [
         ("port", "80", "where"),
@@ -353,7 +352,7 @@ def test_same_name_twice_in_one_run_directory_of_a_group(tmp_path: Path, program
 _ACTIONS = ("arg", "let", "node", "include", "group", "set_parameters_from_file", "nothing")
 _KEYS = (
     *("name", "default", "type", "value", "exec", "param", "from", "to", "remap", "env", "if", "unless", "file", "arg"),
-    *("launch", "run_dir", "namespace", "respawn", "respawn_delay", "hang_timeout", "filename", "period"),
+    *("launch", "run_dir", "respawn", "respawn_delay", "hang_timeout", "filename", "period"),
 )
 _SCALARS = st.one_of(
     st.sampled_from(["true", "1", "-3", "1.5", "a", "talker.py", "grid_slam", "", "int", "params.yaml", "~"]),
