@@ -16,7 +16,7 @@ from instant_ic.config.scalars import Scalar, is_null
 from instant_ic.config.yaml_text import one_line, read_spelled
 from instant_ic.launch.description import HANG_TIMEOUT_S, NodeSpec
 from instant_ic.launch.source import YamlPlace
-from instant_ic.launch.substitutions import MOST_TEXT, LaunchContext, SubstitutionError, substitute, truth
+from instant_ic.launch.substitutions import LaunchContext, SubstitutionError, substitute, truth
 from instant_ic.util import paths
 
 NODE_NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
@@ -189,15 +189,10 @@ def _parameter_value(value: YamlPlace, kind: str, scope: Scope) -> object:
 
 def _texts_replaced(value: YamlPlace, scope: Scope) -> object:
     """Return a list or mapping with its texts after substitution."""
-    length = 0
 
     def read(plain: object) -> object:
-        nonlocal length
         if isinstance(plain, (str, Scalar)) and not is_null(plain):
             text = scope.substituted(str(plain), value)
-            length += len(text)
-            if length > MOST_TEXT:  # 300 bytes of aliases can stand for 100 000 uses of a long text
-                raise value.problem(f"its texts have more than {MOST_TEXT} characters, counting every alias")
             return Scalar(text) if text and isinstance(plain, Scalar) else text
         if isinstance(plain, list):
             return [read(entry) for entry in plain]

@@ -1,25 +1,18 @@
 """Substitutions of launch files: ``$(var NAME)``, ``$(config FILE)``, ``$(run-dir)`` and ``$(eval EXPRESSION)``.
 
-Nothing is ever executed. An expression compares variables and texts by ``==`` and ``!=``, and combines the results by
-``and``, ``or`` and ``not``. The value of a variable is one operand, whatever it looks like.
+Nothing is ever executed: ``simpleeval`` computes the expressions, without functions. A variable in an expression is one
+operand, whatever it looks like.
 """
 
 from __future__ import annotations
 
-import ast
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
-from simpleeval import InvalidExpression, SimpleEval
+from simpleeval import SimpleEval
 
 from instant_ic.util import paths
-
-MOST_TEXT = 1 << 17
-"""Characters of the longest text after substitution; Linux takes no longer argument of a program."""
-_MOST_EXPRESSION = 2000
-"""Characters of the longest expression."""
 
 
 class SubstitutionError(ValueError):
@@ -45,8 +38,8 @@ def substitute(text: str, context: LaunchContext) -> str:
     """Replace every ``$(...)`` of a text.
 
     Raises:
-        SubstitutionError: a substitution or variable is unknown, a file is missing, an expression is wrong, a
-            parenthesis is open, or the result is too long.
+        SubstitutionError: a substitution or variable is unknown, a file is missing, an expression is wrong, or a
+            parenthesis is open.
     """
     parts: list[str] = []
     position = 0
@@ -55,8 +48,6 @@ def substitute(text: str, context: LaunchContext) -> str:
         parts += [text[position:start], _replacement(text[start + 2 : end], context)]
         position = end + 1
     parts.append(text[position:])
-    if sum(map(len, parts)) > MOST_TEXT:  # each of 40 variables may hold its predecessor twice
-        raise SubstitutionError(f"the text has more than {MOST_TEXT} characters after substitution")
     return "".join(parts)
 
 
@@ -104,39 +95,31 @@ def _replacement(body: str, context: LaunchContext) -> str:
     )
 
 
+class _Variable(str):
+    """A variable in an expression: compares as text, and stands for true or false by its text."""
+
+    __slots__ = ()
+    __hash__ = str.__hash__
+
+    def __bool__(self) -> bool:
+        return truth(self)
+
+    def __eq__(self, other: object) -> bool:
+        return str(self) == _text(other)
+
+    def __ne__(self, other: object) -> bool:
+        return not self == other
+
+
 def _evaluated(expression: str, variables: Mapping[str, str]) -> str:
-    """Return the result of an expression as text: ``true``, ``false``, or an operand."""
-    if len(expression) > _MOST_EXPRESSION:
-        raise SubstitutionError(f"$(eval ...) has more than {_MOST_EXPRESSION} characters")
-    evaluator = SimpleEval(operators=_OPERATORS, functions={}, names=dict(variables))
-    permitted = (ast.Expr, ast.Name, ast.Constant, ast.Compare, ast.UnaryOp)
-    evaluator.nodes = {kind: evaluator.nodes[kind] for kind in permitted}
-    evaluator.nodes[ast.BoolOp] = lambda node: _combined(node, evaluator)
+    """Return the result of an expression as text."""
+    names = {"true": True, "false": False, **{name: _Variable(value) for name, value in variables.items()}}
     try:
-        return _text(evaluator.eval(expression))
-    except SyntaxError as error:
-        reason = f"{error.msg}; name variables without $(var ...)" if "$(" in expression else error.msg
-    except InvalidExpression as error:
-        reason = str(error)
-    except (SubstitutionError, ValueError, KeyError) as error:
-        reason = str(error) if isinstance(error, SubstitutionError) else "only ==, !=, and, or, not are supported"
-    except (RecursionError, MemoryError):
-        reason = "it is nested too deeply"
-    raise SubstitutionError(f"$(eval {expression}): {reason}")
-
-
-def _combined(node: Any, evaluator: Any) -> bool:
-    values = (truth(_text(evaluator._eval(value))) for value in node.values)
-    return all(values) if isinstance(node.op, ast.And) else any(values)
+        return _text(SimpleEval(functions={}, names=names).eval(expression))
+    except Exception as error:  # noqa: BLE001 - any error that an operator raises for its operands
+        hint = "; name variables without $(var ...)" if "$(" in expression else ""
+        raise SubstitutionError(f"$(eval {expression}): {error}{hint}") from None
 
 
 def _text(value: object) -> str:
     return str(value).lower() if isinstance(value, bool) else str(value)
-
-
-_OPERATORS: dict[type[ast.AST], Callable[..., bool]] = {
-    ast.Eq: lambda left, right: _text(left) == _text(right),
-    ast.NotEq: lambda left, right: _text(left) != _text(right),
-    ast.Not: lambda value: not truth(_text(value)),
-}
-"""Operators of ``$(eval ...)``; ``==`` compares texts."""
