@@ -1,17 +1,14 @@
 """Check the parameters of a launch description's nodes without starting them.
 
-The check imports the nodes' modules, so ``ic launch`` runs it in a separate process, which frees the memory when it
-ends.
+The check imports the nodes' modules, so ``ic launch`` runs it in a forked process, whose memory is free when it ends.
 """
 
 from __future__ import annotations
 
 import functools
 import itertools
-import json
-import pickle
-import subprocess
-import sys
+import multiprocessing
+import signal
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
@@ -22,6 +19,8 @@ from instant_ic.launch.robot_parameters import RELATED, Driving, disagreements
 from instant_ic.util import paths
 
 if TYPE_CHECKING:
+    from multiprocessing.connection import Connection
+
     from instant_ic.config.params import Values
 
 CHECK_TIMEOUT_S = 120.0
@@ -92,19 +91,29 @@ def check_parameters_apart(nodes: Sequence[NodeSpec]) -> list[str]:
     """
     if not _shipped(nodes):
         return []
-    command = [sys.executable, "-m", "instant_ic.launch.parameters"]
+    context = multiprocessing.get_context("fork")
+    receiver, sender = context.Pipe(duplex=False)
+    process = context.Process(target=_check_and_send, args=(nodes, sender), daemon=True)
+    process.start()
+    sender.close()
     try:
-        done = subprocess.run(command, input=pickle.dumps(list(nodes)), capture_output=True, timeout=CHECK_TIMEOUT_S)
-    except subprocess.TimeoutExpired:
-        raise ParameterCheckError(
-            f"the nodes' parameters could not be checked within {CHECK_TIMEOUT_S:.0f} s: is a module waiting for "
-            "something while it is imported? ic launch FILE --no-check starts without"
-        ) from None
-    if done.returncode != 0:
-        error = done.stderr.decode(errors="replace").strip()
-        raise ParameterCheckError(f"the nodes' parameters could not be checked:\n{error}")
-    problems: list[str] = json.loads(done.stdout)
-    return problems
+        if receiver.poll(CHECK_TIMEOUT_S):
+            problems: list[str] = receiver.recv()
+            return problems
+    except EOFError:
+        raise ParameterCheckError("the nodes' parameters could not be checked: the check crashed") from None
+    finally:
+        process.kill()
+        process.join()
+    raise ParameterCheckError(
+        f"the nodes' parameters could not be checked within {CHECK_TIMEOUT_S:.0f} s: is a module waiting for something "
+        "while it is imported? ic launch FILE --no-check starts without"
+    )
+
+
+def _check_and_send(nodes: Sequence[NodeSpec], sender: Connection) -> None:
+    signal.signal(signal.SIGINT, signal.SIG_DFL)  # Ctrl-C: the launcher reports it
+    sender.send(check_parameters(nodes))
 
 
 def existing_bags(nodes: Sequence[NodeSpec]) -> list[str]:
@@ -210,12 +219,3 @@ def _declared_by_none(spec: NodeSpec, values: Values) -> list[str]:
         for info in parameter_infos(node_class(name).config_class()):
             left.pop(info.name, None)
     return [f"{value.where}: no node has a parameter {key!r}" for key, value in left.items()]
-
-
-def main() -> None:
-    """Check the nodes on standard input, in a separate process; write the problems to standard output."""
-    json.dump(check_parameters(pickle.load(sys.stdin.buffer)), sys.stdout)
-
-
-if __name__ == "__main__":
-    main()
