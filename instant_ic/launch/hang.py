@@ -58,12 +58,3 @@ def _is_runnable(pid: int) -> bool:
         return Path(f"/proc/{pid}/stat").read_text().rpartition(") ")[2].startswith("R")
     except OSError:
         return False
-
-
-def is_traced(pid: int) -> bool:
-    """Return whether a debugger is attached to a process."""
-    try:
-        status = Path(f"/proc/{pid}/status").read_text()
-    except OSError:
-        return False
-    return any(line.startswith("TracerPid:") and line.split()[1] != "0" for line in status.splitlines())

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Protocol
 
 from instant_ic.launch.description import NodeSpec
-from instant_ic.launch.hang import BUSY_FACTOR, is_traced
+from instant_ic.launch.hang import BUSY_FACTOR
 from instant_ic.launch.health import HealthMonitor
 from instant_ic.launch.process import USAGE_STATUS, ManagedProcess, ProcessState, Schedule, describe_exit
 from instant_ic.launch.reaper import kill_marked
@@ -184,7 +184,7 @@ class Supervisor:
             return
         limit_s, silence = process.spec.hang_timeout_s, process.silence
         silence.look(self._health.beat_s(process.spec, process.pid), process.pid, since_s)
-        if silence.beat_s is None or limit_s <= 0 or silence.lasts_s < limit_s or is_traced(process.pid):
+        if silence.beat_s is None or limit_s <= 0 or silence.lasts_s < limit_s:
             return
         if silence.lasts_s < BUSY_FACTOR * limit_s and silence.busy(process.pid):
             if not silence.reported:
