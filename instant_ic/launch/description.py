@@ -73,8 +73,6 @@ class LaunchDescription:
     """Everything that a launch file starts, with its arguments applied."""
 
     file: Path
-    arguments: tuple[LaunchArgument, ...]
-    values: Mapping[str, str]
     nodes: tuple[NodeSpec, ...]
 
     @property

@@ -143,21 +143,10 @@ def pace_of(cores: int, loops_per_s: float, load: float) -> float:
     return min(1.0, max(SLOWEST, share / _NEEDED_CORES * loops_per_s / _ENOUGH_PER_S))
 
 
-class CoreLoad:
-    """How many cores of the machine are idle."""
-
-    def __init__(self) -> None:
-        self._before = self._look()
-
-    def idle_cores(self) -> float:
-        """Return the mean number of idle cores since the last call."""
-        before, self._before = self._before, self._look()
-        seconds = self._before[0] - before[0]
-        return max(0.0, self._before[1] - before[1]) / seconds if seconds > 0 else 0.0
-
-    def _look(self) -> tuple[float, float]:
-        times = psutil.cpu_times()
-        return time.monotonic(), times.idle + times.iowait  # iowait: idle, and waiting for a disk
+def idle_cores() -> float:
+    """Return the mean number of idle cores since the last call."""
+    times = psutil.cpu_times_percent()
+    return float(times.idle + times.iowait) / 100.0 * (os.cpu_count() or 1)  # iowait: idle, and waiting for a disk
 
 
 class Pacing:
@@ -169,7 +158,6 @@ class Pacing:
     def __init__(self, folders: Iterable[Path], report: Callable[[str], None]) -> None:
         self._chooser = PaceChooser(machine_pace())
         self._files = PaceFiles(folders, self._chooser.pace, adapts=True)
-        self._load = CoreLoad()
         self._report = report
         self._reported = 1.0
         self._sample_s = self._report_s = -math.inf
@@ -186,7 +174,7 @@ class Pacing:
         if now_s - self._sample_s < _PERIOD_S:
             return
         self._sample_s = now_s
-        pace = self._chooser.step(PaceSample(now_s, *stack.take_late(), self._load.idle_cores(), stack.cpu_cores))
+        pace = self._chooser.step(PaceSample(now_s, *stack.take_late(), idle_cores(), stack.cpu_cores))
         if pace != self._files.factor:
             self._files.change(pace)
         self._tell(now_s)

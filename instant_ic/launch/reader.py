@@ -181,7 +181,7 @@ def read_launch_file(
     ]
     if problems:
         raise LaunchFileError(sorted(problems, key=lambda problem: (str(problem.file), problem.line)))
-    return LaunchDescription(file, tuple(reader.arguments.values()), scope.context.variables, tuple(nodes))
+    return LaunchDescription(file, tuple(nodes))
 
 
 def read_arguments(file: Path) -> tuple[LaunchArgument, ...]:

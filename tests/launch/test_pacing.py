@@ -2,7 +2,6 @@
 
 import itertools
 import time
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,7 +12,7 @@ from instant_ic.bus.registry import prepare
 from instant_ic.launch import pacing
 from instant_ic.launch.description import NodeSpec
 from instant_ic.launch.health import HealthMonitor
-from instant_ic.launch.pacing import SLOWEST, CoreLoad, PaceChooser, PaceSample, Pacing, pace_of
+from instant_ic.launch.pacing import SLOWEST, PaceChooser, PaceSample, Pacing, pace_of
 from instant_ic.msg import ControlState, Float32, header, pose_message, serialize, twist_message
 from instant_ic.util import pace
 
@@ -121,17 +120,6 @@ def test_first_pace_from_cores_speed_and_load():
     assert pace_of(1, 1e6, 20.0) == SLOWEST
 
 
-def test_idle_cores_from_the_kernels_counters(monkeypatch):
-    counters, now = SimpleNamespace(idle=10.0, iowait=0.5), [5.0]
-    monkeypatch.setattr(pacing.time, "monotonic", lambda: now[0])
-    monkeypatch.setattr(pacing.psutil, "cpu_times", lambda: SimpleNamespace(**vars(counters)))
-    load = CoreLoad()
-    assert load.idle_cores() == 0.0  # no time has passed
-    now[0] += 2.0
-    counters.idle, counters.iowait = 12.4, 0.7
-    assert load.idle_cores() == pytest.approx(1.3)  # 2.6 s in 2 s
-
-
 class Stack:
     """A stack that is as late as the test says."""
 
@@ -146,7 +134,7 @@ def test_the_operator_learns_what_matters(tmp_path, monkeypatch):
     monkeypatch.setattr(pacing.time, "monotonic", lambda: now[0])
     monkeypatch.setattr(pacing.time, "monotonic_ns", lambda: round(now[0] * 1e9))
     monkeypatch.setattr(pacing, "machine_pace", lambda: 1.0)
-    monkeypatch.setattr(CoreLoad, "idle_cores", lambda self: 1.0)
+    monkeypatch.setattr(pacing, "idle_cores", lambda: 1.0)
     lines, stack = [], Stack()
     made = Pacing([tmp_path], lines.append)
     assert not pace.read(tmp_path).real and pace.read(tmp_path).factor == 1.0
@@ -181,12 +169,12 @@ def test_delays_and_stale_sources_come_from_the_simulated_stack(tmp_path):
     group = tmp_path / "left"
     for folder in (tmp_path, group):
         prepare(folder)
-    nodes = [NodeSpec("s", "simulator", (), "ns", run_dir=group, group="left"), NodeSpec("a", "arbiter", ())]
+    nodes = [NodeSpec("s", "simulator", (), run_dir=group, group="left"), NodeSpec("a", "arbiter", ())]
     devices, arbiter = LocalTransport(group, "s", lambda: 1), LocalTransport(tmp_path, "a", lambda: 1)
     monitor = HealthMonitor(nodes, tmp_path)
     try:
         assert monitor.take_late() == (None, False)
-        late = devices.advertise("/ns/simulation/late", "std_msgs/msg/Float32", SENSOR)
+        late = devices.advertise("/simulation/late", "std_msgs/msg/Float32", SENSOR)
         state = arbiter.advertise("/ic/state", "instant_ic_msgs/msg/ControlState", LATCHED)
         found = set()
         for count in range(3000):  # until the subscriptions are connected
