@@ -12,8 +12,9 @@ from instant_ic.bus.control import ControlError, NodeControl, NodeMissingError
 from instant_ic.bus.timers import Timer
 from instant_ic.bus.topics import Subscription
 from instant_ic.console import ConsoleBackend, ConsoleError, ConsoleServer, FrameKind, Look
+from instant_ic.console.backend import PageServer
 from instant_ic.console.config import ConsoleConfig
-from instant_ic.console.feed import PLAN_PERIOD_S, STATE_PERIOD_S, Inputs, PageFeed, PageServer
+from instant_ic.console.feed import PLAN_PERIOD_S, STATE_PERIOD_S, Inputs, PageFeed
 from instant_ic.console.recording import RecorderError, RecordingDesk
 from instant_ic.control.robot_lease import RELEASED
 from instant_ic.util.paths import sign_in_file
@@ -65,8 +66,8 @@ class ConsoleNode(Node[ConsoleConfig], ConsoleBackend):
         self.layers: Subscription | None = None
         self.subscribe("/map", msg.OccupancyGrid, lambda m: feed.grids.take(FrameKind.MAP, m), qos=LATCHED)
         self.subscribe("/costmap", msg.OccupancyGrid, lambda m: feed.grids.take(FrameKind.COSTMAP, m), qos=SENSOR)
-        self.subscribe("/diagnostics", msg.DiagnosticArray, feed.take_diagnostics, qos=RELIABLE)
-        self.subscribe("/heartbeat", msg.NodeStatus, feed.take_heartbeat, qos=RELIABLE)
+        self.subscribe("/diagnostics", msg.DiagnosticArray, feed.faults.take_diagnoses, qos=RELIABLE)
+        self.subscribe("/heartbeat", msg.NodeStatus, feed.faults.take_heartbeat, qos=RELIABLE)
         self.timer(1.0, feed.send_health)
         self.page_timers: list[Timer] = []
         self.feed_page(self.run_dir is None)  # in lockstep there are no pages that could come
@@ -111,7 +112,7 @@ class ConsoleNode(Node[ConsoleConfig], ConsoleBackend):
 
     def reconfigure(self, config: ConsoleConfig) -> None:
         super().reconfigure(config)
-        self.feed.requests.config = config.view
+        self.feed.views.config = config.view
 
     def teardown(self) -> None:
         if hasattr(self, "server"):
@@ -138,7 +139,7 @@ class ConsoleNode(Node[ConsoleConfig], ConsoleBackend):
         self.estop_out.publish(msg.Bool(data=stop))
 
     def on_look(self, look: Look) -> None:
-        self.feed.requests.look = look
+        self.feed.views.look = look
 
     def on_watched(self, watched: bool) -> None:
         self.call_soon(self.feed_page, watched)

@@ -1,5 +1,11 @@
-"""Interface between the page's server and the rest of the station."""
+"""Interfaces between the page's server and the rest of the station."""
 
+from __future__ import annotations
+
+from typing import Any
+
+from instant_ic.console.layers import PageLayers
+from instant_ic.console.protocol import FrameKind
 from instant_ic.console.view import Look
 
 
@@ -41,3 +47,43 @@ class ConsoleBackend:
 
     def on_drawn(self) -> None:
         """Note that ``ConsoleServer.drawn_ms`` has changed."""
+
+
+class PageServer:
+    """Receiver of everything that is sent to pages. This one has a page that shows nothing."""
+
+    @property
+    def plain_http(self) -> bool:
+        """True if token, cookie and commands go over the network unencrypted."""
+        return False
+
+    def now_ms(self) -> float:
+        """Return the server's time in milliseconds."""
+        return 0.0
+
+    def needs_views(self) -> bool:
+        """Return whether a page does not render the virtual space by itself."""
+        return True
+
+    def drawn_ms(self) -> float | None:
+        """Return the time of the newest state that the driver's page has rendered by itself, or None."""
+        return None
+
+    def show(self, *kinds: FrameKind) -> None:
+        """Set which of PANORAMA and VIEW the page shows or soon will; the other is sent at a low rate."""
+
+    def follow_robot(self, holder: str | None, estop: bool = False) -> None:
+        """Take over who has the robot's lease (empty: nobody) and its emergency stop; None: no robot reports."""
+
+    def publish(self, kind: str, message: dict[str, Any]) -> None:
+        """Send a text message of type ``kind`` to every page; it replaces a pending one of this kind."""
+
+    def send_frame(self, kind: FrameKind, header: dict[str, Any], payload: bytes) -> None:
+        """Send an image or map (JPEG or PNG) to every page; it replaces a pending one of this kind."""
+
+    def send_layers(self, layers: PageLayers) -> None:
+        """Send a version of the virtual space to every page; it replaces a pending one.
+
+        Raises:
+            PageProtocolError: a layer that no page could render.
+        """

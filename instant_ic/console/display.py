@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 
+from instant_ic.bus.clock import Clock
 from instant_ic.console.protocol import FrameKind
 from instant_ic.console.robot_poses import RobotPoses
 from instant_ic.control.states import Mode
@@ -24,9 +25,9 @@ class Display:
         image_stamp_ns: stamp of the newest camera image; 0 without one.
     """
 
-    def __init__(self, poses: RobotPoses) -> None:
+    def __init__(self, poses: RobotPoses, clock: Clock) -> None:
         self.mode = self.shown = "none"
-        self._poses = poses
+        self._poses, self._clock = poses, clock
         self._image_ns: int | None = None  # arrival of the newest camera image, steady clock
         self.image_stamp_ns = 0
         self._view = (0, 0, 0.0)  # driver's newest view: request id, arrival (steady ns), delay (s)
@@ -59,46 +60,49 @@ class Display:
             self.mode = MODES.get(int(control.mode), "none")
             self.shown = "virtual" if int(control.shown) == ControlState.SHOWN_VIRTUAL else "real"
 
-    def take_image(self, stamp_ns: int, now_ns: int) -> None:
+    def take_image(self, stamp_ns: int) -> None:
         """Note a camera image."""
-        self._image_ns, self.image_stamp_ns = now_ns, stamp_ns
+        self._image_ns, self.image_stamp_ns = self._clock.steady_ns(), stamp_ns
 
-    def take_view(self, request_id: int, delay_s: float, camera: Pose, now_ns: int) -> None:
+    def take_view(self, request_id: int, delay_s: float, camera: Pose) -> None:
         """Note a view rendered for the driver at the pose ``camera``."""
-        self._view, self._view_pose = (request_id, now_ns, delay_s), camera
+        self._view, self._view_pose = (request_id, self._clock.steady_ns(), delay_s), camera
 
-    def take_drawn(self, drawn_ms: float | None, server_ms: float, now_ns: int) -> None:
+    def take_drawn(self, drawn_ms: float | None, server_ms: float) -> None:
         """Note what the driver's page renders by itself.
 
         Args:
             drawn_ms: time of the newest state that it has shown; None: it shows rendered views.
             server_ms: present time of the same clock.
-            now_ns: steady clock.
         """
         if drawn_ms is not None and drawn_ms != self._drawn_ms:
-            self._drawn_ns = now_ns - round(max(server_ms - drawn_ms, 0.0) * 1e6 * current().factor)
+            self._drawn_ns = self._clock.steady_ns() - round(max(server_ms - drawn_ms, 0.0) * 1e6 * current().factor)
             self._drawn_id = self._drawn_id % (2**32 - 1) + 1  # uint32; 0 means no view
         self._drawn_ms = drawn_ms
 
-    def lose_driver(self, now_ns: int) -> None:
+    def lose_driver(self) -> None:
         """Note the loss of the driver."""
-        self._lost_ns = now_ns
+        self._lost_ns = self._clock.steady_ns()
 
-    def image_age_s(self, now_ns: int) -> float:
-        """Return the age of the newest camera image since its arrival; infinite without one."""
-        return math.inf if self._image_ns is None else (now_ns - self._image_ns) / 1e9
+    @property
+    def image_age_s(self) -> float:
+        """Age of the newest camera image since its arrival; infinite without one."""
+        return math.inf if self._image_ns is None else (self._clock.steady_ns() - self._image_ns) / 1e9
 
-    def report(self, stamp_ns: int, now_ns: int) -> ShownPictures:
+    def report(self) -> ShownPictures:
         """Return the available images, their age and the loss of the driver. Any thread may call it."""
+        stamp_ns, now_ns = self._clock.now_ns(), self._clock.steady_ns()
         lost_ns = self._lost_ns
         view_id, came_ns, delay_s = self._view
         pose = self._view_pose
         if self._drawn_ms is not None:  # the page renders the v-bot's present pose, as of this state
-            view_id, came_ns, delay_s, pose = self._drawn_id, self._drawn_ns, 0.0, self._vbot_camera(pose)
+            view_id, came_ns, delay_s = self._drawn_id, self._drawn_ns, 0.0
+            if (vbot := self._poses.vbot_pose()) is not None:
+                pose = pose_message(vbot @ self._poses.camera_mount())
         return ShownPictures(
             header=header("map", stamp_ns),
             picture_stamp=to_time(self.image_stamp_ns),
-            picture_age_s=self.image_age_s(now_ns),
+            picture_age_s=self.image_age_s,
             view_id=view_id,
             view_pose=pose,
             view_age_s=math.inf if view_id == 0 else (now_ns - came_ns) / 1e9,
@@ -106,8 +110,3 @@ class Display:
             # Steady clock: if the system clock is set back, new commands must not look older than the loss.
             operator_lost=to_time(0 if lost_ns is None else stamp_ns - (now_ns - lost_ns)),
         )
-
-    def _vbot_camera(self, unknown: Pose) -> Pose:
-        """Return the pose of the v-bot's camera; ``unknown`` if it is unknown."""
-        vbot = self._poses.vbot_pose()
-        return unknown if vbot is None else pose_message(vbot @ self._poses.camera_mount())

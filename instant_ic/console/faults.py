@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+from instant_ic.bus.clock import Clock
 from instant_ic.msg import DiagnosticArray, NodeStatus
 
 TIMEOUT_S = 3.0
@@ -13,23 +14,29 @@ OK, WARN, ERROR = 0, 1, 2  # diagnostic_msgs/DiagnosticStatus
 
 
 class FaultList:
-    """Newest diagnoses and heartbeats; ``now_s`` is the steady clock."""
+    """Newest diagnoses and heartbeats."""
 
-    def __init__(self) -> None:
+    def __init__(self, clock: Clock) -> None:
+        self._clock = clock
         self._diagnoses: dict[str, tuple[int, str, float]] = {}
         self._heartbeats: dict[str, tuple[float, bool]] = {}
         self._cpu_percent: dict[str, float] = {}
 
-    def nodes(self, now_s: float) -> list[dict[str, Any]]:
+    @property
+    def _now_s(self) -> float:
+        return self._clock.steady_ns() / 1e9
+
+    def nodes(self) -> list[dict[str, Any]]:
         """Return the running nodes: ``name``, and ``cpu_percent`` of one core."""
         return [
             {"name": name, "cpu_percent": round(self._cpu_percent[name], 1)}
             for name, (seen_s, stopping) in sorted(self._heartbeats.items())
-            if not stopping and now_s - seen_s <= TIMEOUT_S
+            if not stopping and self._now_s - seen_s <= TIMEOUT_S
         ]
 
-    def take_diagnoses(self, message: DiagnosticArray, now_s: float) -> None:
+    def take_diagnoses(self, message: DiagnosticArray) -> None:
         """Store the newest diagnosis of each name."""
+        now_s = self._now_s
         for status in message.status:
             if status.name not in self._diagnoses and len(self._diagnoses) >= MOST_NAMES:
                 self._diagnoses = {n: found for n, found in self._diagnoses.items() if now_s - found[2] < TIMEOUT_S}
@@ -37,15 +44,16 @@ class FaultList:
                     return
             self._diagnoses[status.name] = (int(status.level), status.message, now_s)
 
-    def take_heartbeat(self, message: NodeStatus, now_s: float) -> None:
+    def take_heartbeat(self, message: NodeStatus) -> None:
         """Note a node's heartbeat. A node that announced its shutdown does not count as missing."""
         if message.node not in self._heartbeats and len(self._heartbeats) >= MOST_NAMES:
             return
-        self._heartbeats[message.node] = (now_s, int(message.state) == NodeStatus.STOPPING)
+        self._heartbeats[message.node] = (self._now_s, int(message.state) == NodeStatus.STOPPING)
         self._cpu_percent[message.node] = float(message.cpu_percent)
 
-    def worst(self, now_s: float) -> list[dict[str, str]]:
+    def worst(self) -> list[dict[str, str]]:
         """Return the worst present fault of each node, worst first: ``level`` (warn, error), ``name``, ``text``."""
+        now_s = self._now_s
         found = [
             (level, name.partition(":")[0], text)
             for name, (level, text, seen_s) in self._diagnoses.items()

@@ -1,14 +1,17 @@
-"""Images, state, plan, health and maps for the page, and requests for rendered views. Independent of the bus."""
+"""Images, state, plan, health and maps for the page, and requests for rendered views."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 from instant_ic.adapters.vspace import layers_of
+from instant_ic.bus.clock import Clock
+from instant_ic.bus.topics import Latest
 from instant_ic.console import page_messages as page
+from instant_ic.console.backend import PageServer
 from instant_ic.console.config import ConsoleConfig
 from instant_ic.console.display import Display
 from instant_ic.console.faults import ERROR, OK, WARN, FaultList
@@ -16,21 +19,21 @@ from instant_ic.console.gridimage import GridLayers
 from instant_ic.console.layer_meshes import LayerMeshes
 from instant_ic.console.layers import MOST_LAYERS, PageLayers
 from instant_ic.console.protocol import FrameKind, PageProtocolError
-from instant_ic.console.robot_poses import Newest, RobotPoses
+from instant_ic.console.robot_poses import RobotPoses
 from instant_ic.console.server import PLAIN_HTTP
-from instant_ic.console.view_requests import ViewRequests
+from instant_ic.console.view import ViewSchedule
 from instant_ic.geometry.transforms import TransformBuffer
 from instant_ic.msg import (
     CompressedImage,
     ControlState,
-    DiagnosticArray,
-    NodeStatus,
     Odometry,
     RenderedView,
     ShownPictures,
     ViewRequest,
     VspaceLayers,
     VspaceStatus,
+    header,
+    pose_message,
     stamp_ns,
 )
 from instant_ic.util.pace import current
@@ -44,55 +47,13 @@ STATE_PERIOD_S, PLAN_PERIOD_S = 0.05, 0.2
 class Inputs:
     """Newest messages of the topics that are read when something is sent."""
 
-    control: Newest  # ControlState
-    vbot: Newest  # Odometry
-    trajectory: Newest  # Path
-    path: Newest  # Path
-    subgoal: Newest  # PoseStamped
-    vspace: Newest  # VspaceStatus
-    battery: Newest  # BatteryState
-
-
-class FeedClock(Protocol):
-    """Time of the stack's stamps, and a steady clock."""
-
-    def now_ns(self) -> int:
-        """Return the present time for stamps."""
-
-    def steady_ns(self) -> int:
-        """Return a time that is never set back."""
-
-
-class PageServer(Protocol):
-    """Receiver of everything that the feed sends to pages; ``ConsoleServer`` is one."""
-
-    @property
-    def plain_http(self) -> bool:
-        """True if pages come over the network without encryption."""
-
-    def now_ms(self) -> float:
-        """Return the server's time in milliseconds."""
-
-    def needs_views(self) -> bool:
-        """Return whether a page shows rendered views."""
-
-    def drawn_ms(self) -> float | None:
-        """Return the time of the newest state that the driver's page has rendered by itself, or None."""
-
-    def show(self, *kinds: FrameKind) -> None:
-        """Note the kinds of images in the foreground."""
-
-    def follow_robot(self, holder: str | None, estop: bool = False) -> None:
-        """Note who drives the robot, and its emergency stop."""
-
-    def publish(self, kind: str, message: dict[str, Any]) -> None:
-        """Send a message to all pages."""
-
-    def send_frame(self, kind: FrameKind, header: dict[str, Any], payload: bytes) -> None:
-        """Send an image to all pages."""
-
-    def send_layers(self, layers: PageLayers) -> None:
-        """Send the layers of the virtual space to pages that render them."""
+    control: Latest  # ControlState
+    vbot: Latest  # Odometry
+    trajectory: Latest  # Path
+    path: Latest  # Path
+    subgoal: Latest  # PoseStamped
+    vspace: Latest  # VspaceStatus
+    battery: Latest  # BatteryState
 
 
 class PageFeed:
@@ -105,7 +66,7 @@ class PageFeed:
         inputs: newest messages.
         send_request: function that requests a rendered view.
         send_shown: function that reports the available images to the arbiter. Called on any thread.
-        clock: see :class:`FeedClock`.
+        clock: time of the stamps, and a steady time.
         diagnose: function that sets a diagnosis: name, level, text, values.
 
     Attributes:
@@ -121,17 +82,17 @@ class PageFeed:
         inputs: Inputs,
         send_request: Callable[[ViewRequest], None],
         send_shown: Callable[[ShownPictures], None],
-        clock: FeedClock,
+        clock: Clock,
         diagnose: Callable[..., None],
     ) -> None:
         self.watched = True
         self.server = server
         self._meshes = LayerMeshes()
         self._mount = config.camera_mount.xyz
-        self.poses = RobotPoses(tf, inputs.control, inputs.vbot, config.camera_mount.xyz)
-        self.display = Display(self.poses)
-        self.requests = ViewRequests(config.view, self.poses, self.display)
-        self.grids, self.faults = GridLayers(), FaultList()
+        self.poses = RobotPoses(tf, inputs.control, inputs.vbot, config.camera_mount)
+        self.display = Display(self.poses, clock)
+        self.views = ViewSchedule(config.view)
+        self.grids, self.faults = GridLayers(), FaultList(clock)
         self._state_sent_ns = 0
         self._inputs, self._clock, self._diagnose = inputs, clock, diagnose
         self._send_request, self._send_shown = send_request, send_shown
@@ -141,10 +102,10 @@ class PageFeed:
     def take_panorama(self, message: CompressedImage) -> None:
         """Forward a panorama unchanged, with the camera's rotation at its stamp."""
         stamp = stamp_ns(message)
-        self.display.take_image(stamp, self._clock.steady_ns())
+        self.display.take_image(stamp)
         self.report_shown()
-        header = page.panorama_header(self._captured_ms(stamp), self.poses.lookup("map", "camera", stamp))
-        self.server.send_frame(FrameKind.PANORAMA, header, bytes(message.data))
+        fields = page.panorama_header(self._captured_ms(stamp), self.poses.lookup("map", "camera", stamp))
+        self.server.send_frame(FrameKind.PANORAMA, fields, bytes(message.data))
 
     def take_view(self, message: RenderedView) -> None:
         """Forward a rendered view, then request the next one."""
@@ -153,13 +114,13 @@ class PageFeed:
                 "view", ERROR, f"View not shown: its field of view is {message.fov_rad:.3g} rad. Restart nerf."
             )
             return
-        request_id, now_ns = int(message.request_id), self._clock.steady_ns()
-        delay_s = self.requests.answered(request_id, now_ns)
+        request_id = int(message.request_id)
+        delay_s = self.views.answered(request_id, self._clock.steady_ns())
         if delay_s is not None:
-            self.display.take_view(request_id, delay_s, message.pose, now_ns)
+            self.display.take_view(request_id, delay_s, message.pose)
             self.report_shown()
-            header = page.view_header(self._captured_ms(stamp_ns(message)), message)
-            self.server.send_frame(FrameKind.VIEW, header, bytes(message.image.data))
+            fields = page.view_header(self._captured_ms(stamp_ns(message)), message)
+            self.server.send_frame(FrameKind.VIEW, fields, bytes(message.image.data))
         self._request_view()
 
     def layers_of(self, message: VspaceLayers) -> PageLayers | str:
@@ -193,17 +154,9 @@ class PageFeed:
         if self.display.with_vbot:
             self.send_state()
 
-    def take_diagnostics(self, message: DiagnosticArray) -> None:
-        """Store the nodes' diagnoses."""
-        self.faults.take_diagnoses(message, self._clock.steady_ns() / 1e9)
-
-    def take_heartbeat(self, message: NodeStatus) -> None:
-        """Note a node's heartbeat."""
-        self.faults.take_heartbeat(message, self._clock.steady_ns() / 1e9)
-
     def lose_driver(self) -> None:
         """Report a lost driver to the arbiter at once. Called on the server's thread."""
-        self.display.lose_driver(self._clock.steady_ns())
+        self.display.lose_driver()
         self.report_shown(always=True)
 
     # ---- timers --------------------------------------------------------------------------------------
@@ -234,37 +187,40 @@ class PageFeed:
 
     def send_health(self) -> None:
         """Send virtual space, battery, CPU of the nodes, and faults in the text of the node that found them."""
-        age_s = self.display.image_age_s(self._clock.steady_ns())
+        age_s = self.display.image_age_s
         self._check("camera", age_s <= IMAGE_TIMEOUT_S, "no image from the camera", age_s=age_s)
         self._check("controller", self._inputs.control.message is not None, "no state from the arbiter")
         self._check("pose", self.poses.robot_pose() is not None, "the robot's pose is unknown")
-        now_s = self._clock.steady_ns() / 1e9
-        faults = self.faults.worst(now_s)
+        faults = self.faults.worst()
         if self.server.plain_http:  # on the page only, not as a diagnosis: the node itself works
             faults.append({"level": "warn", "name": "network", "text": PLAIN_HTTP})
         newest = self._inputs.vspace.message, self._inputs.battery.message
-        nodes = self.faults.nodes(now_s)
-        self.server.publish("health", page.health_message(*newest, faults, nodes, current().text))
+        self.server.publish("health", page.health_message(*newest, faults, self.faults.nodes(), current().text))
 
     def send_grids(self) -> None:
         """Send map and costmap if they have changed."""
         for kind, image in self.grids.changed():
-            self.server.send_frame(kind, image.header, image.png)
+            self.server.send_frame(kind, image.header, image.payload)
 
     def report_shown(self, always: bool = False) -> None:
         """Report the available images and the loss of the driver. Any thread may call it."""
         if self.watched or always:
-            self.display.take_drawn(self.server.drawn_ms(), self.server.now_ms(), self._clock.steady_ns())
-            self._send_shown(self.display.report(self._clock.now_ns(), self._clock.steady_ns()))
+            self.display.take_drawn(self.server.drawn_ms(), self.server.now_ms())
+            self._send_shown(self.display.report())
 
     def _request_view(self) -> None:
-        if not self.watched:
-            return
+        """Request the view that is due: of the v-bot, or else of the robot if the virtual space can render."""
+        virtual, needed, now_ns = self.display.with_vbot, self.server.needs_views(), self._clock.steady_ns()
         status = self._inputs.vspace.message
         renders = status is not None and int(status.state) in (VspaceStatus.TRAINING, VspaceStatus.READY)
-        request = self.requests.next(renders, self.server.needs_views(), self._clock.now_ns(), self._clock.steady_ns())
-        if request is not None:
-            self._send_request(request)
+        map_from_base = self.poses.vbot_pose() if virtual else self.poses.robot_pose()
+        if not self.watched or not (virtual or renders) or map_from_base is None:
+            return
+        if self.views.is_due(virtual and needed, now_ns):
+            number, (fov_rad, width, height) = self.views.next(needed, now_ns)
+            pose = pose_message(map_from_base @ self.poses.camera_mount() @ self.views.look.rotation())
+            head = header("map", self._clock.now_ns())
+            self._send_request(ViewRequest(head, number, pose, fov_rad, width, height))
 
     def _check(self, name: str, fine: bool, fault: str, **values: Any) -> None:
         self._diagnose(name, OK if fine else WARN, "" if fine else fault, **values)

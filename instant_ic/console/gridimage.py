@@ -2,35 +2,19 @@
 
 from __future__ import annotations
 
-import zlib
 from collections.abc import Iterator
-from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from instant_ic.console.protocol import FrameKind
+from instant_ic.console.protocol import FrameKind, PendingFrame
 from instant_ic.msg import OccupancyGrid, grid_array
 
 UNKNOWN = 255
 
 
-@dataclass(frozen=True)
-class GridImage:
-    """A grid as a grey PNG; row 0 is the highest y.
-
-    Attributes:
-        header: resolution (m), width and height (cells), x and y (m) of the lower left corner in the grid's frame.
-        png: encoded image.
-        digest: checksum of header and image.
-    """
-
-    header: dict[str, float]
-    png: bytes
-    digest: int
-
-
-def grid_image(grid: NDArray[np.int8], resolution: float, origin_xy: tuple[float, float]) -> GridImage | None:
+def grid_image(grid: NDArray[np.int8], resolution: float, origin_xy: tuple[float, float]) -> PendingFrame | None:
     """Encode the known cells of a grid as a PNG, with a margin of 2 cells.
 
     Args:
@@ -39,7 +23,8 @@ def grid_image(grid: NDArray[np.int8], resolution: float, origin_xy: tuple[float
         origin_xy: lower left corner of the grid, m.
 
     Returns:
-        The image; None if no cell is known.
+        A grey PNG, whose row 0 is the highest y, with resolution (m), width and height (cells), x and y (m) of the
+        lower left corner in the grid's frame; None if no cell is known.
     """
     known_rows = np.flatnonzero((grid >= 0).any(axis=1))
     known_columns = np.flatnonzero((grid >= 0).any(axis=0))
@@ -56,18 +41,7 @@ def grid_image(grid: NDArray[np.int8], resolution: float, origin_xy: tuple[float
         "x": float(origin_xy[0] + column * resolution),
         "y": float(origin_xy[1] + row * resolution),
     }
-    data = grey_png(grey)
-    return GridImage(header, data, zlib.crc32(data, zlib.crc32(repr(header).encode())))
-
-
-def grey_png(grey: NDArray[np.uint8]) -> bytes:
-    """Encode a grey image (H, W) as PNG."""
-    import cv2
-
-    ok, png = cv2.imencode(".png", grey, [cv2.IMWRITE_PNG_COMPRESSION, 3])
-    if not ok:
-        raise ValueError(f"PNG encoder failed on an image of {grey.shape[1]}x{grey.shape[0]} pixels")
-    return bytes(png.tobytes())
+    return PendingFrame(header, cv2.imencode(".png", grey, [cv2.IMWRITE_PNG_COMPRESSION, 3])[1].tobytes())
 
 
 class GridLayers:
@@ -75,17 +49,17 @@ class GridLayers:
 
     def __init__(self) -> None:
         self._newest: dict[FrameKind, OccupancyGrid] = {}
-        self._sent_digests: dict[FrameKind, int] = {}
+        self._sent: dict[FrameKind, PendingFrame] = {}
 
     def take(self, kind: FrameKind, message: OccupancyGrid) -> None:
         """Store the newest grid of a kind."""
         self._newest[kind] = message
 
-    def changed(self) -> Iterator[tuple[FrameKind, GridImage]]:
+    def changed(self) -> Iterator[tuple[FrameKind, PendingFrame]]:
         """Yield the grids that differ from the last ones yielded."""
         while self._newest:
             kind, message = self._newest.popitem()
             image = grid_image(*grid_array(message))
-            if image is not None and self._sent_digests.get(kind) != image.digest:
-                self._sent_digests[kind] = image.digest
+            if image is not None and self._sent.get(kind) != image:
+                self._sent[kind] = image
                 yield kind, image

@@ -17,8 +17,8 @@ from instant_ic.console.config import ConsoleServerConfig
 from instant_ic.console.connections import CLOSE_S, LimitedConnection
 from instant_ic.console.drive import DriveService
 from instant_ic.console.layers import PageLayers
-from instant_ic.console.protocol import FrameKind, PageProtocolError, flag, number, parse_text, whole
-from instant_ic.console.session import PageSession, PendingFrame
+from instant_ic.console.protocol import FrameKind, PageProtocolError, PendingFrame, flag, number, parse_text, whole
+from instant_ic.console.session import PageSession
 from instant_ic.console.view import MAX_FOV_RAD, Look
 from instant_ic.control.robot_lease import Verdict
 from instant_ic.util.pace import current

@@ -52,6 +52,18 @@ class PageFrame:
     payload: bytes
 
 
+@dataclass(frozen=True)
+class PendingFrame:
+    """A frame without a sequence number; ``payload`` is JPEG or PNG."""
+
+    header: dict[str, Any]
+    payload: bytes
+
+    def frame(self, held: frozenset[str]) -> tuple[dict[str, Any], bytes]:
+        """Return header and payload, as ``PageLayers.frame`` does."""
+        return self.header, self.payload
+
+
 def encode_frame(frame: PageFrame) -> bytes:
     """Encode ``frame`` as one binary WebSocket message."""
     header = json.dumps(frame.header, separators=(",", ":"), allow_nan=False).encode()

@@ -2,21 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Any, Protocol
-
 import numpy as np
 
+from instant_ic.bus.topics import Latest
+from instant_ic.config.robot import Mount
 from instant_ic.geometry.poses import Matrix, pose2_from_matrix, transform_points
 from instant_ic.geometry.transforms import TransformBuffer, TransformError
 from instant_ic.msg import Path, matrix_from_pose, path_array
-
-
-class Newest(Protocol):
-    """Holder of a topic's newest message."""
-
-    @property
-    def message(self) -> Any:
-        """The newest message; None if there is none or it is too old."""
 
 
 class RobotPoses:
@@ -26,14 +18,11 @@ class RobotPoses:
         tf: transform tree.
         control: newest ControlState.
         vbot: newest odometry of the v-bot.
-        camera_xyz: position of the camera on the robot while the tree lacks its mount, m.
+        mount: mount of the camera while the tree lacks it.
     """
 
-    def __init__(
-        self, tf: TransformBuffer, control: Newest, vbot: Newest, camera_xyz: tuple[float, float, float]
-    ) -> None:
-        self._tf, self._control, self._vbot = tf, control, vbot
-        self._camera_xyz = camera_xyz
+    def __init__(self, tf: TransformBuffer, control: Latest, vbot: Latest, mount: Mount) -> None:
+        self._tf, self._control, self._vbot, self._mount = tf, control, vbot, mount
 
     def lookup(self, target: str, source: str, stamp_ns: int | None = None) -> Matrix | None:
         """Return ``target_from_source`` at ``stamp_ns``, else the newest one; None if the tree has a gap."""
@@ -61,7 +50,7 @@ class RobotPoses:
         """Return base_from_camera with the identity as rotation: look directions are relative to the heading."""
         mount = np.eye(4)
         base_from_camera = self.lookup("base_link", "camera")
-        mount[:3, 3] = self._camera_xyz if base_from_camera is None else base_from_camera[:3, 3]
+        mount[:3, 3] = self._mount.xyz if base_from_camera is None else base_from_camera[:3, 3]
         return mount
 
     def points(self, path: Path | None) -> list[list[float]]:

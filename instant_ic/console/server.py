@@ -23,15 +23,14 @@ from urllib.parse import quote, unquote, urlsplit
 from aiohttp import web
 
 from instant_ic.console.access import COOKIE, Access, AccessError, Role, tls_context
-from instant_ic.console.backend import ConsoleBackend
+from instant_ic.console.backend import ConsoleBackend, PageServer
 from instant_ic.console.config import ConsoleServerConfig
 from instant_ic.console.connections import CLOSE_S, HEADERS_S, AddressBuckets, Listener, network_of
 from instant_ic.console.drive import DriveService
 from instant_ic.console.layers import PageLayers
 from instant_ic.console.log_rate import limit_logs
 from instant_ic.console.pages import Pages, now_ms
-from instant_ic.console.protocol import FrameKind
-from instant_ic.console.session import PendingFrame
+from instant_ic.console.protocol import FrameKind, PendingFrame
 from instant_ic.util.web_access import host_allowed, is_loopback
 
 STATIC = Path(__file__).parent / "static"
@@ -60,7 +59,7 @@ class ConsoleError(RuntimeError):
     """The server cannot start or stop; the text says why and what to do."""
 
 
-class ConsoleServer:
+class ConsoleServer(PageServer):
     """Serves the page and its WebSocket at ``/ws``.
 
     Args:
@@ -77,8 +76,6 @@ class ConsoleServer:
     Raises:
         ConsoleError: token or certificate cannot be used.
     """
-
-    now_ms = staticmethod(now_ms)
 
     def __init__(
         self, backend: ConsoleBackend, config: ConsoleServerConfig | None = None, page: dict[str, Any] | None = None
@@ -137,7 +134,6 @@ class ConsoleServer:
 
     @property
     def plain_http(self) -> bool:
-        """True if token, cookie and commands go over the network unencrypted."""
         return self._tls is None and not is_loopback(self.config.host)
 
     @property
@@ -153,45 +149,31 @@ class ConsoleServer:
         token = self.access.made_token
         return f"{self.url}?token={quote(token)}" if token else self.url
 
+    def now_ms(self) -> float:
+        return now_ms()
+
     def publish(self, kind: str, message: dict[str, Any]) -> None:
-        """Send a text message of type ``kind`` to every page; it replaces a pending one of this kind."""
         text = json.dumps({"type": kind, **message}, separators=(",", ":"), allow_nan=False)
         self._call(self.pages.publish, kind, text)
 
     def send_frame(self, kind: FrameKind, header: dict[str, Any], payload: bytes) -> None:
-        """Send an image or map to every page; it replaces a pending one of this kind.
-
-        Args:
-            kind: content of the frame.
-            header: JSON header of the frame.
-            payload: JPEG or PNG.
-        """
         self._call(self.pages.send_frame, kind, PendingFrame(header, payload))
 
     def send_layers(self, layers: PageLayers) -> None:
-        """Send a version of the virtual space to every page; it replaces a pending one.
-
-        Raises:
-            PageProtocolError: a layer that no page could render.
-        """
         layers.check()
         _ = layers.digests  # on this thread: hashing takes milliseconds
         self._call(self.pages.send_layers, layers)
 
     def drawn_ms(self) -> float | None:
-        """Return the time of the newest state that the driver's page has shown; see :meth:`Pages.drawn_ms`."""
         return self.pages.drawn_ms()
 
     def needs_views(self) -> bool:
-        """Return whether a page does not render the virtual space by itself."""
         return self.pages.needs_views()
 
     def follow_robot(self, holder: str | None, estop: bool = False) -> None:
-        """Take over who has the robot's lease (empty: nobody) and its emergency stop; None: no robot reports."""
         self._call(self.drive.follow, holder, estop)
 
     def show(self, *kinds: FrameKind) -> None:
-        """Set which of PANORAMA and VIEW the page shows or soon will; the other is sent at a low rate."""
         self._call(self.pages.show, frozenset(kinds))
 
     def _call(self, function: Callable[..., None], *args: Any) -> None:

@@ -6,32 +6,20 @@ import asyncio
 import json
 import time
 from collections import deque
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 from aiohttp import web
 
 from instant_ic.console.connections import LimitedConnection
 from instant_ic.console.layers import PageLayers
-from instant_ic.console.protocol import FrameKind, PageFrame, encode_frame
+from instant_ic.console.protocol import FrameKind, PageFrame, PendingFrame, encode_frame
 from instant_ic.util.web_access import TokenBucket
 
 MAX_REPLIES = 256  # pending, about one second of a page's traffic; a client with more does not read
 # Smallest first: an image must not delay the state, nor a map an image.
 FRAME_ORDER = (FrameKind.VIEW, FrameKind.PANORAMA, FrameKind.LAYERS, FrameKind.MAP, FrameKind.COSTMAP)
 PART_BYTES = 64 * 1024  # a larger frame of layers is sent in pieces: on a slow link it would hold up pongs for seconds
-
-
-@dataclass(frozen=True)
-class PendingFrame:
-    """PageFrame that has no sequence number yet."""
-
-    header: dict[str, Any]
-    payload: bytes
-
-    def frame(self, held: frozenset[str]) -> tuple[dict[str, Any], bytes]:
-        """Return header and payload, as ``PageLayers.frame`` does."""
-        return self.header, self.payload
 
 
 class PageSession:

@@ -1,16 +1,13 @@
-"""The operator's look direction, and the shape of the views rendered for it."""
+"""Views of the virtual space for the operator: where he looks, and which view to request when."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated
 
-import numpy as np
-from numpy.typing import NDArray
-
 from instant_ic.config.ranges import Checked, Positive, Range
-from instant_ic.geometry.poses import pose_matrix
+from instant_ic.geometry.poses import Matrix, pose_matrix
 
 MAX_FOV_RAD = math.radians(150)
 FOV_MARGIN = 1.15
@@ -21,6 +18,7 @@ PROBE = (64, 36)
 """Pixels of a view that is not shown: it keeps the expected PSNR in VspaceStatus up to date."""
 PROBE_HZ = 1.0
 """Requests a second while no view is shown."""
+_MOST_PENDING = 8
 
 
 @dataclass(frozen=True)
@@ -50,23 +48,14 @@ class Look:
     hfov: float = math.radians(90)
     vfov: float = math.radians(58.7)
 
-    def rotation(self) -> NDArray[np.float64]:
+    def rotation(self) -> Matrix:
         """Return camera_from_look (4, 4): x along the line of sight, y left, z up."""
         # In x-forward, y-left axes a positive turn about y lowers the line of sight.
         return pose_matrix(0.0, 0.0, 0.0, 0.0, -self.pitch, self.yaw)
 
 
-@dataclass(frozen=True)
-class ViewShape:
-    """Horizontal field of view (rad) and size (pixels) of a requested view."""
-
-    fov_rad: float
-    width: int
-    height: int
-
-
-def view_shape(look: Look, config: ViewConfig) -> ViewShape:
-    """Return the shape of a view that covers ``look`` with the margin, in the window's aspect ratio.
+def view_shape(look: Look, config: ViewConfig) -> tuple[float, int, int]:
+    """Return field of view (rad), width and height of a view that covers ``look`` with the margin, as the window does.
 
     The number of pixels follows the configuration for any window shape, because it determines the render time.
     Width and height are multiples of 8.
@@ -79,4 +68,48 @@ def view_shape(look: Look, config: ViewConfig) -> ViewShape:
     height = max(16, 8 * round(math.sqrt(pixels / aspect) / 8))
     # If the aspect ratio was clamped or rounded, the larger field of view wins.
     fov = 2 * math.atan(max(half_width, half_height * width / height))
-    return ViewShape(fov, width, height)
+    return fov, width, height
+
+
+class ViewSchedule:
+    """Times at which views are requested: one is outstanding at a time; the next follows its answer or time-out.
+
+    Views are shown while a page needs them. Otherwise small ones are requested, for the expected PSNR.
+
+    Attributes:
+        config: rate and size; may be replaced at any time.
+        look: the driver's look direction.
+    """
+
+    def __init__(self, config: ViewConfig) -> None:
+        self.config = config
+        self.look = Look()
+        self._newest, self._outstanding, self._asked_ns = 0, False, -math.inf
+        self._sent_ns: dict[int, int | None] = {}  # recent requests: id -> send time (steady ns); None: only judged
+
+    def is_due(self, shown: bool, now_ns: int) -> bool:
+        """Return whether to request a view now (steady clock), which is shown or only judged."""
+        since_s = (now_ns - self._asked_ns) / 1e9
+        if self._outstanding and since_s < RESPONSE_TIMEOUT_S:
+            return False
+        return since_s >= 1.0 / (self.config.virtual_rate_hz if shown else PROBE_HZ) - 0.001
+
+    def next(self, needed: bool, now_ns: int) -> tuple[int, tuple[float, int, int]]:
+        """Return id and shape of the next request; ``needed``: a page shows rendered views."""
+        self._newest = self._newest % (2**32 - 1) + 1  # uint32 in ViewRequest; 0 stays unused
+        self._outstanding, self._asked_ns = True, now_ns
+        self._sent_ns[self._newest] = now_ns if needed else None
+        while len(self._sent_ns) > _MOST_PENDING:
+            del self._sent_ns[next(iter(self._sent_ns))]
+        size = self.config if needed else replace(self.config, width=PROBE[0], height=PROBE[1])
+        return self._newest, view_shape(self.look, size)
+
+    def answered(self, request_id: int, now_ns: int) -> float | None:
+        """Note an answer; return its delay in seconds, None for a view that is not shown.
+
+        A slow renderer answers after the time-out, which is when its delay matters most.
+        """
+        if request_id == self._newest:
+            self._outstanding = False
+        sent_ns = self._sent_ns.get(request_id, now_ns)
+        return None if sent_ns is None else (now_ns - sent_ns) / 1e9

@@ -24,6 +24,8 @@ from numpy.typing import NDArray
 
 from instant_ic.bag.replay import make_node
 from instant_ic.bus.lockstep import LockstepBus, Record
+from instant_ic.console.backend import PageServer
+from instant_ic.console.protocol import FrameKind
 from instant_ic.experiments.plots import jpeg
 from instant_ic.experiments.teleop_figures import DriveLog, Shown
 from instant_ic.geometry.poses import (
@@ -129,37 +131,7 @@ class EmulatedPort:
         """Do nothing: the line is in memory."""
 
 
-class UnseenPage:
-    """A connected page without a person in front of it; a :class:`~instant_ic.console.feed.PageServer`."""
-
-    plain_http = False
-
-    def now_ms(self) -> float:
-        return 0.0
-
-    def needs_views(self) -> bool:
-        return True
-
-    def drawn_ms(self) -> float | None:
-        return None
-
-    def show(self, *kinds: Any) -> None:
-        """Ignore which kinds of images are in the foreground."""
-
-    def follow_robot(self, holder: str | None, estop: bool = False) -> None:
-        """Ignore who drives the robot."""
-
-    def publish(self, kind: str, message: dict[str, Any]) -> None:
-        """Ignore a message to the page."""
-
-    def send_frame(self, kind: Any, header: dict[str, Any], payload: bytes) -> None:
-        """Ignore an image to the page."""
-
-    def send_layers(self, layers: Any) -> None:
-        """Ignore the layers of the virtual space."""
-
-
-class _Page(UnseenPage):
+class _Page(PageServer):
     """Passes on the images and the state that the console sends to its page."""
 
     def __init__(self, stack: SimulatedStack) -> None:
@@ -181,10 +153,10 @@ class _Page(UnseenPage):
             self.virtual = virtual
             self._stack.on_show()
 
-    def send_frame(self, kind: Any, header: dict[str, Any], payload: bytes) -> None:
+    def send_frame(self, kind: FrameKind, header: dict[str, Any], payload: bytes) -> None:
         """Pass on images of camera and virtual space, but not maps."""
-        if kind.name in ("VIEW", "PANORAMA"):
-            self._stack.on_frame(kind.name == "VIEW", header, payload)
+        if kind in (FrameKind.VIEW, FrameKind.PANORAMA):
+            self._stack.on_frame(kind is FrameKind.VIEW, header, payload)
 
 
 class SimulatedStack:

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from instant_ic.console.backend import ConsoleBackend
 from instant_ic.console.config import ConsoleServerConfig
-from instant_ic.console.gridimage import GridImage, grid_image
-from instant_ic.console.protocol import FrameKind
+from instant_ic.console.gridimage import grid_image
+from instant_ic.console.protocol import FrameKind, PendingFrame
 from instant_ic.console.recording import RecorderError, RecordingDesk
 from instant_ic.console.server import ConsoleServer
 from instant_ic.console.view import PROBE_HZ, Look, ViewConfig, view_shape
@@ -94,7 +94,7 @@ class Demo(ConsoleBackend):
         self.robot: Pose = np.zeros(3)
         self.vbot: Pose = np.zeros(3)
         self.plan: dict[str, Any] = {"trajectory": [], "path": [], "subgoal": None}
-        self.costmap: GridImage | None = None
+        self.costmap: PendingFrame | None = None
         self._command = (0.0, 0.0)
         self.placing = threading.Lock()
         self._transitions = 0
@@ -136,7 +136,7 @@ class Demo(ConsoleBackend):
         for kind, cells in ((FrameKind.MAP, grid), (FrameKind.COSTMAP, demo_world.inflate(grid, 0.05))):
             image = grid_image(cells, 0.05, origin)
             assert image is not None
-            self.server.send_frame(kind, image.header, image.png)
+            self.server.send_frame(kind, image.header, image.payload)
         for thread in self._threads:
             thread.start()
 
@@ -260,16 +260,16 @@ class Demo(ConsoleBackend):
     def _send_view(self) -> None:
         captured_ms = self.server.now_ms()
         look = self.look
-        shape = view_shape(look, self.config.view)
+        fov_rad, width, height = view_shape(look, self.config.view)
         camera = _camera(self.vbot if self.mode == "virtual" else self.robot) @ look.rotation()
-        directions = _turned(perspective_directions(shape.width, shape.height, shape.fov_rad), camera)
+        directions = _turned(perspective_directions(width, height, fov_rad), camera)
         image = demo_world.shade(_position(camera), directions)
         image = np.clip(image * np.array(self.tint), 0, 255).astype(np.uint8)
         header = {
             "captured_ms": captured_ms,
             "q": quaternion_from_matrix(camera).tolist(),
             "p": camera[:3, 3].tolist(),
-            "fov": shape.fov_rad,
+            "fov": fov_rad,
             "confidence": 0.9,
             "render_ms": 20.0,
         }

@@ -18,6 +18,7 @@ from aiohttp import WSMsgType
 from console_servers import DRIVE, WAIT_S, WATCH, run, token_file, until
 from test_console_access import certificate
 
+from instant_ic.bus.clock import ManualClock
 from instant_ic.console import ConsoleClient, ConsoleServerConfig, FrameKind
 from instant_ic.console import connections as connections_module
 from instant_ic.console.connections import AddressBuckets, network_of
@@ -279,17 +280,21 @@ def test_fault_requests_whose_clients_have_left_wait_for_ever(serve, monkeypatch
 
 def test_fault_another_machines_reports_grow_the_consoles_memory():
     """Each under a new name: they come over the bridge, also from a host that does not drive."""
-    faults, most = FaultList(), MOST_NAMES
+    clock, most = ManualClock(), MOST_NAMES
+    faults = FaultList(clock)
     for number in range(3 * most):
+        clock.set(number * 1_000_000)
         name = f"node{number}"
         status = SimpleNamespace(name=f"{name}: link", level=2, message="lost")
-        faults.take_diagnoses(SimpleNamespace(status=[status]), now_s=0.001 * number)
-        faults.take_heartbeat(SimpleNamespace(node=name, state=2, cpu_percent=1.0), now_s=0.001 * number)
-    assert len(faults.nodes(now_s=1.0)) == most
-    assert faults.worst(now_s=1.0)[0]["text"] == "lost"
+        faults.take_diagnoses(SimpleNamespace(status=[status]))
+        faults.take_heartbeat(SimpleNamespace(node=name, state=2, cpu_percent=1.0))
+    clock.set(1_000_000_000)
+    assert len(faults.nodes()) == most
+    assert faults.worst()[0]["text"] == "lost"
     late = SimpleNamespace(name="arbiter: control", level=2, message="stopped")
-    faults.take_diagnoses(SimpleNamespace(status=[late]), now_s=100.0)
-    assert [fault["text"] for fault in faults.worst(now_s=100.0)].count("stopped") == 1  # it finds a place
+    clock.set(100_000_000_000)
+    faults.take_diagnoses(SimpleNamespace(status=[late]))
+    assert [fault["text"] for fault in faults.worst()].count("stopped") == 1  # it finds a place
 
 
 def test_networks_of_addresses():
@@ -493,7 +498,8 @@ def test_connections_without_complete_headers_are_few_and_small(serve, monkeypat
 
 SERVER_WITHOUT_FILES = """
     import resource, sys
-    from instant_ic.console import ConsoleBackend, ConsoleServer, ConsoleServerConfig
+    from instant_ic.bus.clock import ManualClock
+from instant_ic.console import ConsoleBackend, ConsoleServer, ConsoleServerConfig
     from instant_ic.console.access import AccessConfig
     many = dict(max_connections=1000, max_connections_per_address=1000)
     server = ConsoleServer(ConsoleBackend(), ConsoleServerConfig(port=0, access=AccessConfig(simulated=True), **many))

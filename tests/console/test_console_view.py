@@ -21,18 +21,18 @@ def test_look_left_and_up():
 def test_view_covers_what_is_shown_with_the_margin():
     # 16:9 window: tan(45°) = 1, tan(vfov/2) = 9/16
     look = Look(hfov=math.pi / 2, vfov=2 * math.atan(9 / 16))
-    shape = view_shape(look, ViewConfig(width=320, height=180))
-    assert shape.fov_rad >= math.pi / 2 * 1.15 - 1e-9
-    vertical = 2 * math.atan(math.tan(shape.fov_rad / 2) * shape.height / shape.width)
+    fov_rad, width, height = view_shape(look, ViewConfig(width=320, height=180))
+    assert fov_rad >= math.pi / 2 * 1.15 - 1e-9
+    vertical = 2 * math.atan(math.tan(fov_rad / 2) * height / width)
     assert vertical >= look.vfov * 1.15 - 0.03
-    assert shape.width % 8 == shape.height % 8 == 0
-    assert abs(shape.width * shape.height / (320 * 180) - 1) < 0.1
+    assert width % 8 == height % 8 == 0
+    assert abs(width * height / (320 * 180) - 1) < 0.1
 
 
 def test_extreme_windows_stay_within_a_drawable_field_of_view():
-    shape = view_shape(Look(hfov=2.6, vfov=0.1), ViewConfig())
-    assert shape.fov_rad <= math.radians(150) + 1e-9
-    assert shape.width / shape.height < 2.7
+    fov_rad, width, height = view_shape(Look(hfov=2.6, vfov=0.1), ViewConfig())
+    assert fov_rad <= math.radians(150) + 1e-9
+    assert width / height < 2.7
 
 
 def test_grid_is_cropped_and_turned_top_down():
@@ -42,7 +42,7 @@ def test_grid_is_cropped_and_turned_top_down():
     image = grid_image(grid, 0.5, (-1.0, -2.0))
     # 2 cells of margin: columns 8..16, rows 3..10
     assert image.header == {"resolution": 0.5, "width": 9, "height": 8, "x": -1 + 8 * 0.5, "y": -2 + 3 * 0.5}
-    cells = cv2.imdecode(np.frombuffer(image.png, np.uint8), cv2.IMREAD_UNCHANGED)
+    cells = cv2.imdecode(np.frombuffer(image.payload, np.uint8), cv2.IMREAD_UNCHANGED)
     assert cells.shape == (8, 9)
     assert cells[7 - (5 - 3), 10 - 8] == 100
     assert cells[7 - (8 - 3), 14 - 8] == 0

@@ -28,9 +28,9 @@ from control_world import (
 )
 
 from instant_ic.bus.lockstep import LockstepBus, Record
+from instant_ic.console.backend import PageServer
 from instant_ic.console.config import ConsoleConfig, ConsoleServerConfig
 from instant_ic.control.states import Mode
-from instant_ic.experiments.teleop_stack import UnseenPage
 from instant_ic.msg import (
     ControlState,
     PoseWithCovariance,
@@ -111,7 +111,7 @@ class RateWorld:
         for node in (VirtualRobotNode, NavigatorNode):
             self.bus.add(node)
         self.arbiter = self.bus.add(ArbiterNode)
-        self.console = self.bus.add(ConsoleNode, ConsoleConfig(server=ConsoleServerConfig(port=0)), page=UnseenPage())
+        self.console = self.bus.add(ConsoleNode, ConsoleConfig(server=ConsoleServerConfig(port=0)), page=PageServer())
         static = draw_map(walls, (-2, -1.2, length_m - 2, 1.2))
         self.bus.publish("/map", grid_message(static.occupancy, 0.05, static.origin, "map", self.now), latched=True)
         mounts = [("velodyne", 0.6), ("camera", 1.2)]
