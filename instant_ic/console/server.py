@@ -77,6 +77,8 @@ class ConsoleServer(PageServer):
         ConsoleError: token or certificate cannot be used.
     """
 
+    now_ms = staticmethod(now_ms)
+
     def __init__(
         self, backend: ConsoleBackend, config: ConsoleServerConfig | None = None, page: dict[str, Any] | None = None
     ) -> None:
@@ -148,9 +150,6 @@ class ConsoleServer(PageServer):
         """Address of the page, with the token if this start made one; opening it signs in."""
         token = self.access.made_token
         return f"{self.url}?token={quote(token)}" if token else self.url
-
-    def now_ms(self) -> float:
-        return now_ms()
 
     def publish(self, kind: str, message: dict[str, Any]) -> None:
         text = json.dumps({"type": kind, **message}, separators=(",", ":"), allow_nan=False)
