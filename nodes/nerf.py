@@ -21,15 +21,16 @@ from instant_ic.msg import (
 )
 from instant_ic.vspace import SpaceState
 from instant_ic.vspace.config import NerfConfig
-from instant_ic.vspace.jobs import IncomingKeyframe, JobOutcome, SpaceWorker, ViewOrder, load_robot_mask
-from instant_ic.vspace.schedule import JobSchedule, Turns
+from instant_ic.vspace.layers import Layers
+from instant_ic.vspace.prior import load_robot_mask
+from instant_ic.vspace.worker import EncodedView, IncomingKeyframe, Job, SpaceWorker, Turns, ViewOrder
 
 _STATUS_S = 0.5
 _LOCKSTEP_S, _LOCKSTEP_ITERATIONS = 0.1, 5  # in tests and replay training runs by iterations, not by time
 
 
 class NerfNode(Node[NerfConfig]):
-    """One thread takes keyframes, renders and trains in turn; ``JobSchedule`` decides what is next."""
+    """``/keyframe``, ``/view/request`` → ``/vspace/view``, ``/vspace/layers``, ``/vspace/status``."""
 
     name = "nerf"
     live_parameters = ("render_fps", "train_ms_per_frame", "max_view_pixels", "jpeg_quality")
@@ -44,64 +45,59 @@ class NerfNode(Node[NerfConfig]):
         self.image_out = self.publisher("/vspace/image/compressed", CompressedImage, qos=SENSOR)
         self.status_out = self.publisher("/vspace/status", VspaceStatus, qos=LATCHED)
         self.layers_out = self.publisher("/vspace/layers", VspaceLayers, qos=LATCHED)
-        self.work = SpaceWorker(config.space, robot, warm=not self.lockstep)
-        worker = self.background(self.work.run, self.on_outcome)
         turns = Turns(config.render_fps, config.train_ms_per_frame)
-        self.schedule = JobSchedule(config.space, turns, worker.submit, self.lockstep)
-        self.schedule.start()
+        self.worker = worker = SpaceWorker(config.space, turns, self.clock.now_ns, robot, self.lockstep)
+        worker.submit = self.background(worker.run, self.on_done).submit
+        worker.diagnose, worker.on_layers, worker.on_view = self.diagnose, self.publish_layers, self.publish_view
+        worker.start()
         self.subscribe("/keyframe", Keyframe, self.on_keyframe, qos=LATCHED)
         self.subscribe("/view/request", ViewRequest, self.on_request, qos=SENSOR)
         self.timer(_STATUS_S, self.publish_status)
         if self.lockstep:
-            self.timer(_LOCKSTEP_S, lambda: self.schedule.train(_LOCKSTEP_ITERATIONS))
+            self.timer(_LOCKSTEP_S, lambda: worker.train(_LOCKSTEP_ITERATIONS))
         self.publish_status()
 
     def reconfigure(self, config: NerfConfig) -> None:
         super().reconfigure(config)
-        self.schedule.turns.render_fps = config.render_fps
-        self.schedule.turns.train_ms_per_frame = config.train_ms_per_frame
+        self.worker.turns.render_fps = config.render_fps
+        self.worker.turns.train_ms_per_frame = config.train_ms_per_frame
 
     def on_keyframe(self, keyframe: Any) -> None:
         decode = functools.partial(decode_keyframe, keyframe)
         image = np.asarray(keyframe.panorama.data, np.uint8).tobytes()
-        self.schedule.offer_keyframe(IncomingKeyframe(keyframe.id, keyframe, self.clock.now_ns(), decode, image))
+        self.worker.offer_keyframe(IncomingKeyframe(keyframe.id, keyframe, self.clock.now_ns(), decode, image))
 
     def on_request(self, request: Any) -> None:
         most = self.config.max_view_pixels
-        if self.schedule.state == SpaceState.EMPTY:
-            self.diagnose("view", WARN, f"no view can be rendered yet: {self.schedule.text()}")
+        if self.worker.state == SpaceState.EMPTY:
+            self.diagnose("view", WARN, f"no view can be rendered yet: {self.worker.text()}")
         elif int(request.width) * int(request.height) > most:
             text = f"{request.width} x {request.height} requested, max_view_pixels is {most}"
             self.diagnose("view", WARN, text)
         else:
             pose = functools.partial(matrix_from_pose, request.pose)
             size = request.width, request.height, request.fov_rad
-            self.schedule.request_view(ViewOrder(request.id, request, pose, *size, self.config.jpeg_quality))
+            self.worker.request_view(ViewOrder(request.id, request, pose, *size, self.config.jpeg_quality))
 
-    def on_outcome(self, outcome: JobOutcome) -> None:
-        changed = self.schedule.take(outcome, self.clock.now_ns())
-        self.report(outcome)
-        if outcome.layers is not None:
-            self.layers_out.publish(layers_message(outcome.layers, self.clock.now_ns()))
-        if outcome.encoded is not None:
-            self.publish_view(outcome)
-        if changed:
+    def on_done(self, job: Job) -> None:
+        before = self.worker.state, self.worker.keyframe
+        self.worker.take(job)
+        if job.error is not None and job.is_bug:
+            self.callbacks.fault(f"virtual space, {job.name}", job.error)
+        if (self.worker.state, self.worker.keyframe) != before:
             self.publish_status()
-        self.schedule.next()
+        self.worker.next()
 
-    def report(self, outcome: JobOutcome) -> None:
-        self.diagnose_all(*self.schedule.findings(outcome))
-        if outcome.error is not None and outcome.is_bug:
-            self.callbacks.fault(f"virtual space, {outcome.job.kind.value}", outcome.error)
+    def publish_layers(self, layers: Layers) -> None:
+        self.layers_out.publish(layers_message(layers, self.clock.now_ns()))
 
-    def publish_view(self, outcome: JobOutcome) -> None:
-        assert outcome.job.view is not None and outcome.encoded is not None
-        view = view_message(outcome.job.view, outcome.encoded, self.schedule, self.clock.now_ns())
+    def publish_view(self, order: ViewOrder, encoded: EncodedView) -> None:
+        view = view_message(order, encoded, self.worker, self.clock.now_ns())
         self.view_out.publish(view)
         self.image_out.publish(view.image)
 
     def publish_status(self) -> None:
-        self.status_out.publish(status_message(self.schedule, self.clock.now_ns()))
+        self.status_out.publish(status_message(self.worker, self.clock.now_ns()))
 
 
 if __name__ == "__main__":

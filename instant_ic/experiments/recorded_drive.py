@@ -147,8 +147,8 @@ def _moments(
     keyframes: Sequence[tuple[float, Any]],
 ) -> list[Moment]:
     from instant_ic.msg import image_array, matrix_from_pose
+    from instant_ic.util.limits import decode_rgb
     from instant_ic.vspace import VirtualSpace, VirtualSpaceConfig
-    from instant_ic.vspace.jobs import decode_panorama
 
     space, shown = VirtualSpace(VirtualSpaceConfig(source="warp", panorama_width=1024)), -1
     base_from_camera = np.eye(4)
@@ -167,7 +167,7 @@ def _moments(
                 if math.hypot(ahead[0, 3], ahead[1, 3]) < 0.5:  # else the keyframe is older than this drive's motion
                     base_from_camera[:2, 3] = ahead[:2, 3]
                 depth = np.asarray(image_array(message.depth), np.float32)
-                rgb = decode_panorama(np.asarray(message.panorama.data, np.uint8))
+                rgb = decode_rgb(np.asarray(message.panorama.data, np.uint8))
                 space.set_keyframe(rgb, depth, pose, float(message.relative_sigma))
                 shown = newest
             x, y, yaw = log.vbot[row]
@@ -175,7 +175,7 @@ def _moments(
             found.append(Moment(float(time_s), True, view.softened()))
             continue
         if time_s in photos:
-            rgb = decode_panorama(np.frombuffer(photos[time_s], np.uint8))
+            rgb = decode_rgb(np.frombuffer(photos[time_s], np.uint8))
             found.append(Moment(float(time_s), False, perspective_crop(rgb, np.eye(3), *SIZE, math.pi / 2)))
     return found
 

@@ -43,8 +43,8 @@ from instant_ic.msg import (
 )
 from instant_ic.msg import OccupancyGrid as OccupancyGridMessage
 from instant_ic.slam.occupancy import OccupancyGrid
+from instant_ic.util.limits import decode_rgb
 from instant_ic.util.pace import read as read_pace
-from instant_ic.vspace.jobs import decode_panorama
 
 FloatArray: TypeAlias = NDArray[np.float64]
 T = TypeVar("T")
@@ -180,14 +180,14 @@ class _Run:
                 self.requests.publish(request)
             return next((view for view in self.views if view.request_id == number), None)
 
-        return decode_panorama(np.asarray(self.wait(answer, f"view {number}").image.data, np.uint8))
+        return decode_rgb(np.asarray(self.wait(answer, f"view {number}").image.data, np.uint8))
 
 
 def _results(run: _Run, out: Path) -> dict[str, Any]:
     """Wait for the results of a run, write the images, and return the summary."""
     ready_s = run.reach_ready()
     keyframe = run.keyframes[-1]
-    photo = decode_panorama(np.asarray(keyframe.panorama.data, np.uint8))
+    photo = decode_rgb(np.asarray(keyframe.panorama.data, np.uint8))
     scores, strip = _compare_views(run, photo, matrix_from_pose(keyframe.pose))
     cv2.imwrite(str(out / "view.png"), strip[..., ::-1])
     depth_m = np.asarray(image_array(keyframe.depth), np.float32)

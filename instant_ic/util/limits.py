@@ -55,8 +55,10 @@ def decode_image(data: bytes | bytearray | NDArray[np.uint8], flags: int) -> NDA
         return None
 
 
-def decode_rgb(data: bytes | bytearray | NDArray[np.uint8], width: int, height: int) -> NDArray[np.uint8]:
-    """Decode to (H, W, 3) uint8 RGB of at least ``width`` x ``height``.
+def decode_rgb(
+    data: bytes | bytearray | NDArray[np.uint8], width: int = MOST_PIXELS, height: int = MOST_PIXELS
+) -> NDArray[np.uint8]:
+    """Decode to (H, W, 3) uint8 RGB of at least ``width`` x ``height``, or of the full size if that is less.
 
     The decoder reduces the image 2, 4 or 8 times where the result is still large enough, and then computes
     correspondingly less of the inverse cosine transform. The reduced size is rounded up.

@@ -12,11 +12,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from pathlib import Path
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from instant_ic.geometry.projections import equirect_pixels, nearest_pixels
+from instant_ic.util.limits import load_image
 from instant_ic.vspace.config import GeometryConfig
 
 MOST_SIGMA = 0.5
@@ -376,3 +379,24 @@ def _torn_pairs(line: list[NDArray[np.float32]], ratio: float) -> NDArray[np.boo
     off = (np.abs(2 * a - before - b) > limit) & (np.abs(2 * b - after - a) > limit)
     abrupt = (jump > CONFIG.abrupt * np.abs(last - first)) | (jump > CONFIG.large * nearest)
     return (jump > ratio * nearest) & off & abrupt
+
+
+def load_robot_mask(path: str | Path) -> NDArray[np.bool_]:
+    """Load the mask of the robot in its panoramas.
+
+    Args:
+        path: image file, bright where a panorama shows the robot.
+
+    Returns:
+        The mask, (H, 2 H).
+
+    Raises:
+        ValueError: not an image, or not twice as wide as high.
+    """
+    image = load_image(path, cv2.IMREAD_GRAYSCALE)
+    if image is None:
+        raise ValueError(f"robot_mask {path}: no such file, or it cannot be decoded as an image")
+    if image.shape[1] != 2 * image.shape[0]:
+        size = f"{image.shape[1]} x {image.shape[0]}"
+        raise ValueError(f"robot_mask {path}: must be twice as wide as high, as the panorama is (got {size})")
+    return np.asarray(image > 127)

@@ -107,7 +107,7 @@ def test_a_keyframe_fits_the_colours_and_tells_a_wrong_place(cube):
         assert "device" not in bus.node.diagnoses()
         bus.publish("/keyframe", keyframe(depth_factor=2.0))
         bus.advance(1.0)
-        assert "mesh_pose" in bus.node.schedule.status.warning
+        assert "mesh_pose" in bus.node.worker.status.warning
         assert bus.node.diagnoses()["device"][0] == 1
 
 

@@ -17,9 +17,9 @@ from instant_ic.msg import (
     image_message,
     pose_message,
 )
-from instant_ic.vspace import FieldConfig, TrainConfig, VirtualSpace, VirtualSpaceConfig
-from instant_ic.vspace.jobs import IncomingKeyframe, JobKind, JobOutcome, ViewOrder, load_robot_mask
-from instant_ic.vspace.schedule import JobSchedule, Turns
+from instant_ic.vspace import FieldConfig, TrainConfig, VirtualSpaceConfig
+from instant_ic.vspace.prior import load_robot_mask
+from instant_ic.vspace.worker import IncomingKeyframe, SpaceWorker, Turns, ViewOrder
 from nodes.nerf import NerfConfig, NerfNode
 from tests import box_room
 
@@ -113,7 +113,7 @@ def test_a_view_is_rendered_again_only_when_it_would_differ():
     with LockstepBus(start_ns=10 * S) as bus:
         node = bus.add(NerfNode, NerfConfig(space=dataclasses.replace(SPACE, source="warp")))
         bus.publish("/keyframe", keyframe_message(number=4), latched=True)
-        space, rendered = node.work.space, []
+        space, rendered = node.worker.space, []
         whole = space.render
         space.render = lambda *args: rendered.append(args) or whole(*args)
 
@@ -166,7 +166,7 @@ def test_a_gpu_without_memory_is_told_and_the_next_keyframe_recovers(bus):
     bus.publish("/keyframe", keyframe_message(1), latched=True)
     bus.advance(0.3)
     node = next(n for n in bus.nodes if isinstance(n, NerfNode))
-    device = node.work.space.device.backend
+    device = node.worker.space.device.backend
     whole = device.step
 
     def no_memory(*args):
@@ -186,19 +186,19 @@ def test_a_gpu_without_memory_is_told_and_the_next_keyframe_recovers(bus):
 
 def test_of_waiting_keyframes_and_views_the_newest_is_taken():
     jobs = []
-    schedule = JobSchedule(SPACE, Turns(10, 50), jobs.append, lockstep=True)
-    schedule.start()
+    worker = SpaceWorker(SPACE, Turns(10, 50), lambda: 0, lockstep=True)
+    worker.submit, worker.diagnose = jobs.append, lambda *args, **values: None
+    worker.start()
     for number in (1, 2, 3):
-        schedule.offer_keyframe(IncomingKeyframe(number, None, 0, tuple))
-        schedule.request_view(ViewOrder(number, None, tuple, 64, 36, 1.0, 90))
-    status = VirtualSpace(SPACE).status
-    schedule.take(JobOutcome(jobs.pop(), status=status), 0)  # the warm-up has ended
-    schedule.next()
+        worker.offer_keyframe(IncomingKeyframe(number, None, 0, tuple))
+        worker.request_view(ViewOrder(number, None, tuple, 64, 36, 1.0, 90))
+    worker.take(worker.run(jobs.pop()))  # the warm-up has ended
+    worker.next()
     view = jobs.pop()
-    assert (view.kind, view.view.id) == (JobKind.RENDER, 3)
-    schedule.take(JobOutcome(view, status=status, refused="no keyframe"), 0)
-    schedule.next()
-    assert [(job.kind, job.keyframe.id) for job in jobs] == [(JobKind.KEYFRAME, 3)]
+    assert (view.name, view.number) == ("view", 3)
+    worker.take(worker.run(view))  # fails: no keyframe
+    worker.next()
+    assert [(job.name, job.number) for job in jobs] == [("keyframe", 3)]
 
 
 def test_a_pose_far_off_is_drawn_without_confidence_and_told(bus):
@@ -228,7 +228,7 @@ def test_the_robots_mask(tmp_path):
     with LockstepBus(start_ns=10 * S) as bus:
         node = bus.add(NerfNode, NerfConfig(space=SPACE, robot_mask=str(tmp_path / "mask.png")))
         bus.publish("/keyframe", keyframe_message(1), latched=True)
-        assert node.work.space.keyframe.usable.mean() == pytest.approx(1 - 12 * 10 / (32 * 64))
+        assert node.worker.space.keyframe.usable.mean() == pytest.approx(1 - 12 * 10 / (32 * 64))
     for content, words in ((None, "no such file"), (np.zeros((32, 32), np.uint8), "twice as wide")):
         path = tmp_path / "bad.png"
         if content is not None:

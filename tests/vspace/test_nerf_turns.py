@@ -2,7 +2,7 @@
 
 import pytest
 
-from instant_ic.vspace.schedule import LEAST_SHARE, Turns
+from instant_ic.vspace.worker import LEAST_SHARE, Turns
 
 
 def run(render_ms, asks_fps, render_fps=10.0, train_ms=50.0, seconds=20.0, trains=True, iteration_ms=5.0):
