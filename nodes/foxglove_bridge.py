@@ -12,7 +12,7 @@ from instant_ic.util.diagnosis import RecentCount
 from instant_ic.util.paths import sign_in_file
 from instant_ic.util.web_access import AccessError, is_loopback, offer_sign_in
 
-_LEAST_S = 0.02
+_LOOK_S, _LEAST_S = 0.25, 0.02
 REFUSED_S = 10.0  # a refusal is a warning for this long
 
 
@@ -53,15 +53,11 @@ class FoxgloveBridgeNode(Node[FoxgloveBridgeConfig]):
 
     def _look(self) -> None:
         assert self.server is not None
-        next_s = 0.0
         while not self.stopping:
-            now_s = time.monotonic()
-            if now_s >= next_s or self.server.wake.is_set():
-                next_s = now_s + self.config.discovery_period_s
-                self.server.wake.clear()
-                self.call_soon(self.reconcile)
-                time.sleep(_LEAST_S)  # limits the cost of a viewer that connects and disconnects without end
-            self.server.wake.wait(max(next_s - time.monotonic(), 0.0))
+            self.server.wake.wait(_LOOK_S)
+            self.server.wake.clear()
+            self.call_soon(self.reconcile)
+            time.sleep(_LEAST_S)  # limits the cost of a viewer that connects and disconnects without end
 
     def reconcile(self) -> None:
         """Update the offered topics to the present topics and viewers."""
@@ -69,7 +65,7 @@ class FoxgloveBridgeNode(Node[FoxgloveBridgeConfig]):
         if server is None or self.stopping:
             return
         server.reconcile(self._watch.topics())
-        counts = {"messages": server.count, "megabytes": server.bytes / 1e6, "dropped": server.dropped}
+        counts = {"messages": server.count, "dropped": server.dropped}
         self.diagnose("topics", OK, f"{len(server.watched)} of {len(server.topics)} topics watched", **counts)
         if server.refused:
             lately = self._refused.rise(server.refused, time.monotonic_ns())

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 import struct
 from collections.abc import Mapping
 from typing import Any
@@ -22,13 +21,9 @@ class FoxgloveProtocolError(ValueError):
     """A client's frame violates the protocol; the message says how."""
 
 
-# -- server to client ----------------------------------------------------------------------------------
-
-
 def text(op: str, **content: Any) -> str:
-    """Return a text message; fields that are None are omitted."""
-    fields = {key: value for key, value in content.items() if value is not None}
-    return json.dumps({"op": op, **fields}, separators=(",", ":"), allow_nan=False)
+    """Return a text message for a client."""
+    return json.dumps({"op": op, **content}, separators=(",", ":"), allow_nan=False)
 
 
 def status(level: int, message: str) -> str:
@@ -41,70 +36,40 @@ def message_data(subscription: int, log_ns: int, payload: bytes | memoryview) ->
     return _MESSAGE_DATA.pack(1, subscription, log_ns) + payload
 
 
-def parameters(values: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """Return parameters in the protocol's form; those without a value are omitted."""
-    found = []
-    for name, value in values.items():
-        if value is None:
-            continue
-        entry: dict[str, Any] = {"name": name, "value": _finite(value)}
-        if entry["value"] == value:  # else converted to text
-            if isinstance(value, float):
-                entry["type"] = "float64"
-            elif isinstance(value, (list, tuple)) and all(isinstance(item, float) for item in value):
-                entry["type"] = "float64_array"
-        found.append(entry)
-    return found
+def parameter_values(values: Mapping[str, Any], request: str) -> str:
+    """Return the answer to a request for parameters. Infinity and NaN, which JSON lacks, become text."""
+    values = json.loads(json.dumps(values), parse_constant=str)
+    entries = [{"name": name, "value": value} for name, value in values.items() if value is not None]
+    return text("parameterValues", parameters=entries, id=request)
 
 
-def _finite(value: Any) -> Any:
-    """Return a value that JSON can carry: infinity and NaN become text."""
-    if isinstance(value, float) and not math.isfinite(value):
-        return str(value)
-    if isinstance(value, (list, tuple)):
-        return [_finite(item) for item in value]
-    return value
+def parse(data: str) -> tuple[str, list[Any], str]:
+    """Parse a client's text message.
 
+    Returns:
+        Its op, its arguments and its request id. The arguments are pairs (subscription, channel) of ``subscribe``,
+        subscriptions of ``unsubscribe``, names of ``getParameters``, and none of other messages.
 
-# -- client to server: each function raises FoxgloveProtocolError for a frame or field of another form ---
-
-
-def parse_text(data: str) -> dict[str, Any]:
-    """Parse a client's text message: a JSON object with a text field ``op``."""
+    Raises:
+        FoxgloveProtocolError: the message or one of its fields has another form.
+    """
     try:
         content = json.loads(data)
-    except (ValueError, RecursionError) as error:
-        raise FoxgloveProtocolError(f"not JSON: {error}") from None
-    if not isinstance(content, dict) or not isinstance(content.get("op"), str):
-        raise FoxgloveProtocolError("not a JSON object with an op")
-    return content
+        op, request = str(content["op"]), str(content.get("id", ""))
+        arguments: list[Any] = []
+        if op == "subscribe":
+            arguments = [(_number(each["id"]), _number(each["channelId"])) for each in content["subscriptions"]]
+        elif op == "unsubscribe":
+            arguments = [_number(each) for each in content["subscriptionIds"]]
+        elif op == "getParameters":
+            arguments = [str(each) for each in content["parameterNames"]]
+    except (LookupError, TypeError, ValueError, RecursionError) as error:
+        raise FoxgloveProtocolError(f"Invalid message: {type(error).__name__}: {error}") from None
+    return op, arguments, request
 
 
-def objects(content: Mapping[str, Any], key: str) -> list[dict[str, Any]]:
-    """Return a field that must be a list of objects."""
-    return _listed(content, key, dict, "objects")
-
-
-def strings(content: Mapping[str, Any], key: str) -> list[str]:
-    """Return a field that must be a list of strings."""
-    return _listed(content, key, str, "strings")
-
-
-def numbers(content: Mapping[str, Any], key: str) -> list[int]:
-    """Return a field that must be a list of channel or subscription numbers."""
-    return [number({key: item}, key) for item in _listed(content, key, object, "numbers")]
-
-
-def _listed(content: Mapping[str, Any], key: str, kind: type, what: str) -> list[Any]:
-    value = content.get(key)
-    if not isinstance(value, list) or not all(isinstance(item, kind) for item in value):
-        raise FoxgloveProtocolError(f"{content.get('op')}: {key} must be a list of {what}")
-    return value
-
-
-def number(content: Mapping[str, Any], key: str) -> int:
-    """Return a field that must be a 32-bit number."""
-    value = content.get(key)
-    if not isinstance(value, int) or isinstance(value, bool) or not 0 <= value <= _MAX_NUMBER:
-        raise FoxgloveProtocolError(f"{key} must be a 32-bit number (got {value!r:.40})")
+def _number(value: Any) -> int:
+    """Return the number of a channel or subscription."""
+    if type(value) is not int or not 0 <= value <= _MAX_NUMBER:
+        raise ValueError(f"{value!r:.40} is not a 32-bit number")
     return value

@@ -106,7 +106,7 @@ class FoxgloveWorld:
         return thing
 
     def bridge(self, **parameters):
-        config = FoxgloveBridgeConfig(port=0, discovery_period_s=0.05, **{"simulated": True, **parameters})
+        config = FoxgloveBridgeConfig(port=0, **{"simulated": True, **parameters})
         self.live = self.keep(LiveNode(self.run_dir, FoxgloveBridgeNode, config, "foxglove_bridge"))
         return self.live.node
 

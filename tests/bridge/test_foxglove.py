@@ -268,12 +268,12 @@ def test_a_stalled_loop_or_viewer_never_holds_the_node_up_and_what_is_dropped_is
     wait_for(lambda: out.subscriber_count == 1, "the subscription")
     stalled, release = threading.Event(), threading.Event()
 
-    def parse_text(data):
+    def parse(data):
         stalled.set()
         release.wait(120)
-        return {"op": "unadvertise"}
+        return "unadvertise", [], ""
 
-    monkeypatch.setattr(foxglove_protocol, "parse_text", parse_text)
+    monkeypatch.setattr(foxglove_protocol, "parse", parse)
     client.socket.send("anything")
     try:
         assert stalled.wait(30)
@@ -304,7 +304,6 @@ def test_a_stalled_loop_or_viewer_never_holds_the_node_up_and_what_is_dropped_is
         '{"op": "unsubscribe", "subscriptionIds": [NaN]}',
         '{"op": "getParameters", "parameterNames": "x"}',
         '{"op": "getParameters", "parameterNames": ["/a/../x.y"], "id": "r"}',
-        '{"op": "getParameters", "parameterNames": [], "id": 7}',
         "[" * 30_000,
         b"",
         b"\x09zz",
