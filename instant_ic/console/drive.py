@@ -11,7 +11,7 @@ import contextlib
 import logging
 import math
 import secrets
-from collections import Counter, deque
+from collections import deque
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Annotated
@@ -82,7 +82,6 @@ class DriveGate:
         self.estop = False
         self._robot_known = False  # the robot reports its emergency stop
         self._pressed = -math.inf  # emergency stop pressed here and not confirmed by the robot
-        self.counts: Counter[Verdict] = Counter()
         self.watchdog_trips = 0
         self.last_age_s: float | None = None
         self._accepted: deque[float] = deque(maxlen=RATE_COMMANDS)
@@ -172,7 +171,6 @@ class DriveGate:
             self._let_go_since = now
         refusal = self._gate.check_twist(linear, angular)
         verdict = self._judge(client, sequence, age_s, moves) if refusal is None else refusal.verdict
-        self.counts[verdict] += 1
         if verdict is not Verdict.ACCEPTED:
             return verdict
         self._sequence[client] = sequence
@@ -289,7 +287,7 @@ class DriveService:
 
     Attributes:
         gate: decides which command is valid.
-        on_change: called when driver, emergency stop or the number of watchdog trips has changed.
+        on_change: called when driver, robot's driver or emergency stop has changed.
     """
 
     def __init__(self, backend: ConsoleBackend, config: DriveConfig) -> None:
@@ -301,7 +299,7 @@ class DriveService:
         self._commanding: int | None = None  # client in whose name the backend commands
         self._holder: str | None = None  # who has the robot's lease; empty: nobody; None: unknown
         self._trips = 0
-        self._before = self._state
+        self._reported = self._state
         self._wake = asyncio.Event()
 
     @property
@@ -342,14 +340,14 @@ class DriveService:
         if self.gate.watchdog_trips != self._trips:
             self._trips = self.gate.watchdog_trips
             logger.warning("no drive command for %.2f s: published zero", self.gate.config.watchdog_s)
-        if self._state != self._before:
-            self._before = self._state
+        if self._state != self._reported:
+            self._reported = self._state
             self.on_change()
         self._wake.set()
 
     @property
     def _state(self) -> tuple[object, ...]:
-        return self.gate.driver, self.gate.estop, self.gate.watchdog_trips, self._holder
+        return self.gate.driver, self.gate.estop, self._holder
 
     def look(self, now: float) -> None:
         """Let the gate look whether this process has stood still, before it handles anything."""

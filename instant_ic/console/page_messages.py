@@ -47,13 +47,7 @@ def state_message(
     return state | {
         "reason": control.reason,
         "estop": bool(control.estop),
-        "blocked": bool(control.blocked),
-        "transitions": int(control.transitions),
         "command": [finite(value) for value in twist_values(control.operator_command)],
-        "applied": [finite(value) for value in twist_values(control.applied_command)],
-        "pose_gap_m": finite(control.pose_gap_m),
-        "yaw_gap_rad": finite(control.yaw_gap_rad),
-        "time_to_obstacle_s": finite(control.time_to_obstacle_s),
     }
 
 
@@ -115,9 +109,6 @@ def view_header(captured_ms: float, view: RenderedView) -> dict[str, Any]:
         "captured_ms": captured_ms,
         **pose_fields(matrix_from_pose(view.pose)),
         "fov": float(view.fov_rad),
-        "confidence": finite(view.confidence),
-        "render_ms": finite(view.render_ms),
-        "request_id": int(view.request_id),
     }
 
 

@@ -214,11 +214,8 @@ class Pages:
         session.reply(
             {
                 "type": "hello",
-                "client": session.number,
-                "server_ms": now_ms(),
                 "max_linear": drive.max_linear_mps,
                 "max_angular": drive.max_angular_rps,
-                "rate_hz": drive.rate_hz,
                 "may_drive": session.may_drive,
                 "page": self.page,
             }
@@ -239,7 +236,6 @@ class Pages:
                 "door": self._drive.door(self.sessions),
                 "clients": len(self.sessions),
                 "estop": self._drive.gate.estop,
-                "watchdog_trips": self._drive.gate.watchdog_trips,
             }
             session.put_text("session", json.dumps(message))
 

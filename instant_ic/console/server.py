@@ -339,16 +339,7 @@ class ConsoleServer(PageServer):
         return web.FileResponse(STATIC / "index.html")
 
     async def _health(self, request: web.Request) -> web.StreamResponse:
-        gate = self.drive.gate
-        return web.json_response(
-            {
-                "clients": len(self.pages.sessions),
-                "driver": gate.driver,
-                "estop": gate.estop,
-                "watchdog_trips": gate.watchdog_trips,
-                "commands": {verdict.name.lower(): count for verdict, count in gate.counts.items()},
-            }
-        )
+        return web.json_response({"clients": len(self.pages.sessions)})
 
     async def _estop(self, request: web.Request) -> web.StreamResponse:
         """Set the emergency stop without the page's WebSocket, which may be stuck but alone can release it."""

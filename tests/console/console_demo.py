@@ -97,7 +97,6 @@ class Demo(ConsoleBackend):
         self.costmap: PendingFrame | None = None
         self._command = (0.0, 0.0)
         self.placing = threading.Lock()
-        self._transitions = 0
         self._slow_due = 0.0
         self._directions = equirect_directions(self.config.panorama_width, self.config.panorama_width // 2)
         self.panorama, self.panorama_camera = b"", np.zeros((4, 4))  # last panorama (JPEG) and its camera pose
@@ -205,7 +204,6 @@ class Demo(ConsoleBackend):
             )
         else:
             self.mode, self.reason = self.forced_mode, ""
-        self._transitions += before != self.mode
         if self.mode == "virtual":
             if before != "virtual":
                 self.vbot = self.robot.copy()
@@ -226,12 +224,9 @@ class Demo(ConsoleBackend):
                 "shown": "virtual" if self.mode == "virtual" else "real",
                 "reason": self.reason,
                 "estop": self.estop or self.button,
-                "blocked": False,
-                "transitions": self._transitions,
                 "robot": self.robot.round(4).tolist(),
                 "vbot": self.vbot.round(4).tolist() if self.mode == "virtual" else None,
                 "command": [v, w],
-                "applied": [v, w],
                 "twist": [v, w],
             },
         )
@@ -270,8 +265,6 @@ class Demo(ConsoleBackend):
             "q": quaternion_from_matrix(camera).tolist(),
             "p": camera[:3, 3].tolist(),
             "fov": fov_rad,
-            "confidence": 0.9,
-            "render_ms": 20.0,
         }
         self.server.send_frame(FrameKind.VIEW, header, _jpeg(image))
 

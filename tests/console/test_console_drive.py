@@ -81,7 +81,6 @@ def test_fault_idle_zeros_of_one_client_fight_anothers_commands():
     assert gate.receive(2, 1, 0.0, 0.0, 0.0, 0.01) is Verdict.NOT_DRIVER
     assert gate.command == (0.3, 0.1)
     assert gate.receive(2, 2, 0.0, 0.4, 0.0, 0.02) is Verdict.NOT_DRIVER
-    assert gate.counts[Verdict.NOT_DRIVER] == 2
 
 
 def beating(gate, start, end, *, away=False):

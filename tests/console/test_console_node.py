@@ -208,13 +208,12 @@ def test_panorama_passes_as_it_came_with_the_cameras_heading_and_age(setup):
 def test_state_tells_mode_poses_and_reason(setup):
     bus, _, server = setup
     publish_tree(bus)
-    bus.publish("/ic/state", control(bus, ControlState.REAL, reason="why", blocked=True), latched=True)
+    bus.publish("/ic/state", control(bus, ControlState.REAL, reason="why"), latched=True)
     bus.advance(0.06)
     state = server.texts["state"]
-    assert (state["mode"], state["reason"], state["blocked"]) == ("real", "why", True)
+    assert (state["mode"], state["reason"]) == ("real", "why")
     assert state["robot"] == pytest.approx([1, 2, math.pi / 2], abs=1e-3)
     assert state["vbot"] is None
-    assert state["time_to_obstacle_s"] is None  # inf is no JSON
     assert server.shown == (FrameKind.PANORAMA,)
 
 
@@ -265,7 +264,6 @@ def test_only_one_request_is_outstanding_and_the_rate_follows_the_answers(setup)
     _, frame_header, payload = next(f for f in server.frames if f[0] is FrameKind.VIEW)
     assert payload == b"VIEW"
     assert frame_header["fov"] == pytest.approx(1.8)
-    assert frame_header["render_ms"] is None
     assert frame_header["p"] == pytest.approx([1, 2, 1.5])
 
 

@@ -79,7 +79,7 @@ def test_fault_robot_runs_its_last_command_when_its_page_falls_silent(serve):
         async with ConsoleClient(server.url) as client:
             await client.acquire()
             await client.send_drive(0.3, 0.0)  # one command, then none
-            await client.wait_for(lambda c: c.session["watchdog_trips"] == 1, WAIT_S)
+            await until(lambda: server.drive.gate.watchdog_trips == 1)
             await in_thread(server.backend.wait, lambda b: b.commands[-1] == (0.0, 0.0))
 
     asyncio.run(scenario())
@@ -98,7 +98,7 @@ def test_the_watchdog_follows_the_pace_of_a_simulation(serve):
                 await client.send_drive(0.3, 0.0)
                 await in_thread(server.backend.wait, lambda b: (0.3, 0.0) in b.commands)
                 await asyncio.sleep(0.6)
-                assert client.session["watchdog_trips"] == 0 and server.backend.commands[-1] == (0.3, 0.0)
+                assert server.drive.gate.watchdog_trips == 0 and server.backend.commands[-1] == (0.3, 0.0)
 
         asyncio.run(scenario())
     finally:
