@@ -85,7 +85,7 @@ class ConsoleNode(Node[ConsoleConfig], ConsoleBackend):
                 offer_sign_in(self.server.sign_in_url, sign_in)
         except (ConsoleError, AccessError) as error:
             raise NodeError(str(error)) from error
-        self.recording.start()
+        self.timer(1.0, self.recording.poll)
 
     def feed_page(self, watched: bool) -> None:
         """Send everything as long as there is a page; without one, only keep what a new page gets at once."""

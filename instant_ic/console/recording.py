@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import logging
-import queue
 import threading
-import time
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import PurePath
 from typing import Any
 
-_END_S = 5.0
+MOST_PENDING = 20
 logger = logging.getLogger("instant_ic.console")
 
 
@@ -21,84 +20,68 @@ class RecorderError(RuntimeError):
 class RecordingDesk:
     """Caller of the recorder, with a thread of its own: an answer may take seconds, and the page must not wait.
 
+    Any thread may call its methods. Each ends with a new report.
+
     Args:
         ask: function that calls a command of the recorder (``record``, ``stop``, ``snapshot`` or ``status``) with named
             arguments and returns the answer; raises RecorderError if there is none or the recorder refuses.
-        report: function that takes the page's ``recording`` message, every ``poll_s`` and after each command.
-        poll_s: period of the recorder's status, s.
+        report: function that takes the page's ``recording`` message.
     """
 
-    def __init__(self, ask: Callable[..., Any], report: Callable[[dict[str, Any]], None], poll_s: float = 1.0) -> None:
+    def __init__(self, ask: Callable[..., Any], report: Callable[[dict[str, Any]], None]) -> None:
         self._ask = ask
         self._report = report
-        self._poll_s = poll_s
-        self._wishes: queue.Queue[Callable[[], str] | None] = queue.Queue(maxsize=20)
+        self._thread = ThreadPoolExecutor(1, "recording desk")
+        self._places = threading.Semaphore(MOST_PENDING)
         self._recording = False
         self._notice: dict[str, Any] = {"number": 0, "text": "", "level": "ok"}
-        self._thread = threading.Thread(target=self._run, name="recording desk", daemon=True)
-
-    def start(self) -> None:
-        """Start the thread."""
-        self._thread.start()
 
     def stop(self) -> None:
         """Stop the thread; drop pending commands."""
-        if self._thread.is_alive():
-            self._wish(None)
-            self._thread.join(_END_S)
-
-    # ---- any thread ----------------------------------------------------------------------------------
+        self._thread.shutdown(cancel_futures=True)
 
     def record(self, on: bool) -> None:
         """Start or stop a recording."""
-        self._wish(self._begin if on else self._end)
+        self._submit(self._begin if on else self._end)
 
     def snapshot(self) -> None:
         """Save the last minute."""
-        self._wish(self._snap)
+        self._submit(lambda: f"Saving the last minute: {_name(self._ask('snapshot', reason='operator')['path'])}")
 
     def bookmark(self, name: str) -> None:
         """Confirm a published bookmark to the operator."""
-        self._wish(lambda: f"Bookmark set: {name}" + ("" if self._recording else " (not recording)"))
+        self._submit(lambda: f"Bookmark set: {name}" + ("" if self._recording else " (not recording)"))
 
-    def _wish(self, wish: Callable[[], str] | None) -> None:
+    def poll(self) -> None:
+        """Report the recorder's state."""
+        self._submit(None)
+
+    def _submit(self, command: Callable[[], str] | None) -> None:
+        if self._places.acquire(blocking=False):
+            self._thread.submit(self._do, command)
+        elif command is not None:
+            logger.warning("Recorder command dropped: %d are pending. Wait, then try again.", MOST_PENDING)
+
+    def _do(self, command: Callable[[], str] | None) -> None:
         try:
-            self._wishes.put_nowait(wish)
-        except queue.Full:
-            logger.warning("Recorder command dropped: %d are pending. Wait, then try again.", self._wishes.maxsize)
+            if command is not None:
+                self._notice = {"number": self._notice["number"] + 1} | self._outcome(command)
+            self._report(self.status())
+        finally:
+            self._places.release()
 
-    # ---- the desk's thread ---------------------------------------------------------------------------
-
-    def _run(self) -> None:
-        due = 0.0
-        while True:
-            try:
-                wish = self._wishes.get(timeout=max(due - time.monotonic(), 0.0))
-            except queue.Empty:
-                due = time.monotonic() + self._poll_s
-                self._report(self.status())
-                continue
-            if wish is None:
-                return
-            self._do(wish)
-            due = 0.0
-
-    def _do(self, wish: Callable[[], str]) -> None:
+    def _outcome(self, command: Callable[[], str]) -> dict[str, str]:
         try:
-            text, level = wish(), "ok"
+            return {"text": command(), "level": "ok"}
         except RecorderError as error:
-            text, level = str(error), "error"
             logger.warning("%s", error)
-        self._notice = {"number": self._notice["number"] + 1, "text": text, "level": level}
+            return {"text": str(error), "level": "error"}
 
     def _begin(self) -> str:
         return f"Recording to {_name(self._ask('record')['path'])}"
 
     def _end(self) -> str:
         return f"Recording saved: {_name(self._ask('stop')['path'])}"
-
-    def _snap(self) -> str:
-        return f"Saving the last minute: {_name(self._ask('snapshot', reason='operator')['path'])}"
 
     def status(self) -> dict[str, Any]:
         """Ask the recorder for its state and return the page's ``recording`` message."""

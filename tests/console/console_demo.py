@@ -101,7 +101,7 @@ class Demo(ConsoleBackend):
         self._directions = equirect_directions(self.config.panorama_width, self.config.panorama_width // 2)
         self.panorama, self.panorama_camera = b"", np.zeros((4, 4))  # last panorama (JPEG) and its camera pose
         self.recorder = DemoRecorder()
-        self._desk = RecordingDesk(self.recorder.ask, lambda status: self.server.publish("recording", status), 0.2)
+        self._desk = RecordingDesk(self.recorder.ask, lambda status: self.server.publish("recording", status))
         self._stop = threading.Event()
         self._threads = [
             threading.Thread(target=run, name=f"console-demo-{run.__name__}", daemon=True)
@@ -130,7 +130,6 @@ class Demo(ConsoleBackend):
     def start(self) -> None:
         """Start the server and the robot."""
         self.server.start()
-        self._desk.start()
         grid, origin = demo_world.occupancy()
         for kind, cells in ((FrameKind.MAP, grid), (FrameKind.COSTMAP, demo_world.inflate(grid, 0.05))):
             image = grid_image(cells, 0.05, origin)
@@ -242,6 +241,7 @@ class Demo(ConsoleBackend):
         battery = {"voltage": 24.6, "percent": 81.0}
         health = {"vspace": vspace, "battery": battery, "faults": self.faults, "nodes": self.nodes, "pace": self.pace}
         self.server.publish("health", health)
+        self._desk.poll()
 
     def _send_panorama(self) -> None:
         captured_ms = self.server.now_ms()

@@ -4,7 +4,6 @@ import asyncio
 import queue
 import re
 import threading
-import time
 
 import pytest
 from console_servers import DRIVE, WAIT_S, WATCH
@@ -40,44 +39,40 @@ class FakeRecorder:
 def desk():
     """A desk, its recorder, and a wait for what it tells the page."""
     recorder, told = FakeRecorder(), queue.Queue()
-    made = RecordingDesk(recorder.ask, told.put, poll_s=0.02)
-    made.start()
-
-    def wait_for(condition):
-        deadline = time.monotonic() + WAIT_S
-        while not condition(message := told.get(timeout=WAIT_S)):
-            assert time.monotonic() < deadline, message
-        return message
-
-    yield made, recorder, wait_for
+    made = RecordingDesk(recorder.ask, told.put)
+    yield made, recorder, lambda: told.get(timeout=WAIT_S)
     made.stop()
-    assert "recording desk" not in [thread.name for thread in threading.enumerate()]
+    assert not [thread for thread in threading.enumerate() if thread.name.startswith("recording desk")]
 
 
 def test_a_recording_is_begun_told_and_ended(desk):
-    made, recorder, wait_for = desk
-    assert wait_for(lambda m: m["state"] == "idle")["recorder"] == "ok"
+    made, recorder, report = desk
+    made.poll()
+    told = report()
+    assert (told["recorder"], told["state"]) == ("ok", "idle")
     made.record(True)
-    told = wait_for(lambda m: m["state"] == "recording")
+    told = report()
+    assert told["state"] == "recording"
     assert (told["path"], told["seconds"], told["bytes"], told["free_bytes"]) == ("/d/rec_1", 12.5, 3_000_000, 10**9)
     assert told["notice"] == {"number": 1, "text": "Recording to rec_1", "level": "ok"}
     made.record(False)
     made.snapshot()
-    told = wait_for(lambda m: m["notice"]["number"] == 3)
+    assert (report()["notice"]["number"], (told := report())["notice"]["number"]) == (2, 3)
     assert recorder.asked == [("record", {}), ("stop", {}), ("snapshot", {"reason": "operator"})]
     assert told["notice"]["text"] == "Saving the last minute: rec_1"
 
 
 def test_a_missing_recorder_and_a_refusal_are_told_in_words_and_the_next_wish_counts(desk):
-    made, recorder, wait_for = desk
+    made, recorder, report = desk
     recorder.refusal = "No recorder is running. Launch the station with recorder:=true."
     made.record(True)
-    told = wait_for(lambda m: m["notice"]["number"] == 1)
+    told = report()
     assert told["notice"] == {"number": 1, "text": recorder.refusal, "level": "error"}
     assert (told["recorder"], told["state"], told["text"]) == ("missing", "none", recorder.refusal)
     recorder.refusal = ""
     made.record(True)
-    assert wait_for(lambda m: m["notice"]["number"] == 2)["notice"]["level"] == "ok"
+    told = report()
+    assert (told["notice"]["number"], told["notice"]["level"]) == (2, "ok")
 
 
 # ---- the node --------------------------------------------------------------------------------------
