@@ -1,10 +1,10 @@
 """Control channel of a node: read and change its parameters and log level while it runs.
 
 Each node process listens on ``RUN_DIR/nodes/<node>.sock`` (a Unix socket in a folder of mode 0700). A request is one
-line of JSON, ``{"op": "set", "values": {"rate_hz": 5.0}}``; ``"yaml": {"label": "0123"}`` has values as YAML text. The
-answer is one line too: ``{"ok": true, ...}`` or ``{"ok": false, "error": "what is wrong", "kind": "parameter"}``.
-Separate threads answer, even while the node's own
-thread is in a long callback. Only a change has to wait for the node's thread; it is dropped if it waits too long.
+line of JSON, ``{"op": "set", "values": {"rate_hz": "5.0"}}`` with values as YAML text. The answer is one line too:
+``{"ok": true, ...}`` or ``{"ok": false, "error": "what is wrong", "kind": "parameter"}``. Separate threads answer, even
+while the node's own thread is in a long callback. Only a change has to wait for the node's thread; it is dropped if it
+waits too long.
 """
 
 from __future__ import annotations
@@ -141,7 +141,6 @@ class ControlServer:
     def _operations(self) -> dict[str, Callable[[dict[str, Any]], dict[str, Any]]]:
         return {
             "describe": self._describe,
-            "get": self._get,
             "set": self._set,
             "log_level": self._log_level,
             "status": self._status,
@@ -151,14 +150,11 @@ class ControlServer:
     def _describe(self, request: dict[str, Any]) -> dict[str, Any]:
         return {"parameters": [asdict(info) for info in self._node.parameters.infos()]}
 
-    def _get(self, request: dict[str, Any]) -> dict[str, Any]:
-        return {"values": {info.name: info.value for info in self._node.parameters.infos()}}
-
     def _set(self, request: dict[str, Any]) -> dict[str, Any]:
-        values, texts = request.get("values", {}), request.get("yaml", {})
-        if not isinstance(values, dict) or not isinstance(texts, dict) or not (values or texts):
-            raise _RequestError('set needs "values": {key: value} or "yaml": {key: text}')
-        values |= {key: yaml_value(str(text), key) for key, text in texts.items()}
+        texts = request.get("values")
+        if not isinstance(texts, dict) or not texts:
+            raise _RequestError('set needs "values": {key: YAML text}')
+        values = {key: yaml_value(str(text), key) for key, text in texts.items()}
         return {"changed": self._on_node(lambda: self._node.parameters.set(values))}
 
     def _log_level(self, request: dict[str, Any]) -> dict[str, Any]:
@@ -245,8 +241,7 @@ class NodeControl:
 
     def get(self) -> dict[str, Any]:
         """Return the value of every parameter."""
-        values: dict[str, Any] = self.request({"op": "get"})["values"]
-        return values
+        return {info.name: info.value for info in self.describe()}
 
     def set(self, values: Mapping[str, Any]) -> dict[str, Any]:
         """Change several parameters together, or none; returns those whose value has changed.
@@ -259,7 +254,7 @@ class NodeControl:
             NodeBusyError: the node's thread is busy.
         """
         texts = {key: one_line(value) for key, value in values.items()}
-        changed: dict[str, Any] = self.request({"op": "set", "yaml": texts})["changed"]
+        changed: dict[str, Any] = self.request({"op": "set", "values": texts})["changed"]
         return changed
 
     def log_level(self, level: str | None = None) -> str:

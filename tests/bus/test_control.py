@@ -141,7 +141,7 @@ def test_a_value_typed_by_hand_is_read_by_the_type_of_its_parameter(tuned):
     node, client = tuned
     client.set({"label": yaml_value("0123", "label"), "inner.gain": yaml_value("5e-01", "inner.gain")})
     assert node.config.label == "0123" and node.config.inner.gain == 0.5
-    client.request({"op": "set", "values": {"inner.gain": 0.25}, "yaml": {"label": "1:30"}})
+    client.request({"op": "set", "values": {"inner.gain": 0.25, "label": "1:30"}})
     assert node.config.label == "1:30" and node.config.inner.gain == 0.25
 
 
@@ -234,7 +234,7 @@ def test_log_level(tuned):
         (b"\xff\xfe", "not JSON"),
         (b"[1]", "expected a JSON object"),
         (b"[" * 100_000, "not JSON"),
-        (b'{"op": "explode"}', "unknown op 'explode' (known: describe, get, set, log_level, status, call)"),
+        (b'{"op": "explode"}', "unknown op 'explode' (known: describe, set, log_level, status, call)"),
         (b'{"op": "set", "values": [1]}', 'set needs "values"'),
         (b'{"op": "set", "values": {"inner": 3}}', "is a group"),
     ],

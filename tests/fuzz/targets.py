@@ -429,7 +429,6 @@ def _control() -> Target:
 
     requests: tuple[dict[str, Any], ...] = (
         {"op": "describe"},
-        {"op": "get"},
         {"op": "set", "values": {"period_s": 0.5, "names": ["a"], "inner.gain": 1.0}},
         {"op": "log_level", "level": "debug"},
         {"op": "status"},
