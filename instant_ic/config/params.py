@@ -26,7 +26,8 @@ import yaml
 
 from instant_ic.config.ranges import Checked, Range, range_of
 from instant_ic.config.scalars import READERS, is_null
-from instant_ic.config.yaml_text import compose_yaml, read_spelled, resolved, spelled
+from instant_ic.config.yaml_place import YamlPlace, YamlProblem, load
+from instant_ic.config.yaml_text import read_spelled, resolved
 from instant_ic.util.safe_text import masked, masked_values
 
 ConfigT = TypeVar("ConfigT")
@@ -176,67 +177,26 @@ def load_sections(path: Path) -> dict[str, Values]:
     Raises:
         ParameterError: see :func:`load_file`.
     """
-    try:
-        text = path.read_text()
-    except OSError as error:
-        raise ParameterError(f"{path}: cannot be read: {error.strerror}") from error
-    except UnicodeDecodeError as error:
-        raise ParameterError(f"{path}: cannot be read as UTF-8: {error}") from error
-    try:
-        root = compose_yaml(text)
-        return {} if root is None else _sections(root, path)
-    except yaml.YAMLError as error:
-        mark = getattr(error, "problem_mark", None)
-        where = f"{path}:{mark.line + 1}" if mark else str(path)
-        raise ParameterError(Problem(f"not YAML: {getattr(error, 'problem', error)}", where)) from error
-
-
-def _sections(root: yaml.Node, path: Path) -> dict[str, Values]:
     sections: dict[str, Values] = {}
-    for title, section in _items(root, path):
-        name = title if title == SHARED else title.strip("/")
-        values = sections.setdefault(name, {})
-        for key, body in _items(section, path):
-            if key != "ros__parameters":
-                raise ParameterError(
-                    Problem(f"expected ros__parameters under {title!r}, found {key!r}", _where(path, body))
-                )
-            _flatten(body, "", path, values, name == SHARED)
+    try:
+        for title, section in load(path).fields().items():
+            name = title if title == SHARED else title.strip("/")
+            values = sections.setdefault(name, {})
+            for key, body in section.fields().items():
+                if key != "ros__parameters":
+                    raise body.problem(f"expected ros__parameters under {title!r}, found {key!r}")
+                _flatten(body, "", values, name == SHARED)
+    except YamlProblem as error:
+        raise ParameterError(Problem(error.text, f"{path}:{error.line}")) from error
     return sections
 
 
-def _where(path: Path, node: yaml.Node) -> str:
-    return f"{path}:{node.start_mark.line + 1}"
-
-
-def _items(node: yaml.Node, path: Path) -> list[tuple[str, yaml.Node]]:
-    if isinstance(node, yaml.ScalarNode) and node.value == "":
-        return []
-    if not isinstance(node, yaml.MappingNode):
-        raise ParameterError(Problem("expected a mapping (node name: ros__parameters: key: value)", _where(path, node)))
-    items = [(str(key.value), value) for key, value in node.value]
-    seen: set[str] = set()
-    for key, value in items:
-        if key in seen:
-            raise ParameterError(Problem(f"{key!r} is given twice", _where(path, value)))
-        seen.add(key)
-    return items
-
-
-def _flatten(node: yaml.Node, prefix: str, path: Path, out: Values, shared: bool) -> None:
-    for key, value in _items(node, path):
-        if isinstance(value, yaml.MappingNode) and value.value:
-            _flatten(value, f"{prefix}{key}.", path, out, shared)
+def _flatten(group: YamlPlace, prefix: str, out: Values, shared: bool) -> None:
+    for key, value in group.fields().items():
+        if value.is_mapping and value.fields():
+            _flatten(value, f"{prefix}{key}.", out, shared)
         else:
-            where = _where(path, value)
-            out[prefix + key] = Value(_spelled(value, prefix + key, where), where, path, shared)
-
-
-def _spelled(node: yaml.Node, key: str, where: str) -> Any:
-    try:
-        return spelled(node)
-    except yaml.YAMLError as error:
-        raise ParameterError(Problem(f"{key}: the value is not YAML: {_one_line(error)}", where, key)) from error
+            out[prefix + key] = Value(value.spelled(), f"{value.file}:{value.line}", value.file, shared)
 
 
 def _one_line(error: BaseException) -> str:

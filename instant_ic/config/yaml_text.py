@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable
 from typing import Any, TypeVar
 
@@ -13,9 +12,6 @@ from instant_ic.config.scalars import Scalar
 T = TypeVar("T")
 # Errors that PyYAML raises for a value that does not fit its type, such as `!!int "_"`.
 _STRAY = (ValueError, TypeError, AttributeError, IndexError, KeyError, OverflowError)
-_MOST_FAST = 8192
-"""Levels of nesting up to which the C parser's recursion is sure to fit into a stack."""
-_LINE_END = re.compile("[\n\r\x85\u2028\u2029]")
 _MOST_LEVELS = 100
 _MOST_VALUES = 100_000
 """Values of a document with each alias counted where it is used: 300 bytes of aliases can stand for billions."""
@@ -88,8 +84,13 @@ def compose_yaml(text: str) -> yaml.Node | None:
     Raises:
         yaml.YAMLError: the text is not YAML, it is nested too deeply, or its aliases stand for too many values.
     """
-    fast = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
-    root = _checked(lambda: yaml.compose(text, Loader=fast if _most_levels(text) <= _MOST_FAST else yaml.SafeLoader))
+    loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+    level = 0
+    for event in yaml.parse(text, Loader=loader):  # no recursion, unlike compose(), which would overflow C's stack
+        level += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
+        if level > _MOST_LEVELS:
+            raise _refused(_TOO_DEEP, event)
+    root = _checked(lambda: yaml.compose(text, Loader=loader))
     if root is not None:
         _measure(root, 0, {})
     return root
@@ -161,15 +162,6 @@ def one_line(value: object) -> str:
     return text.rstrip("\n").removesuffix("\n...").rstrip("\n")
 
 
-def _most_levels(text: str) -> int:
-    """Return an upper bound of the levels of nesting in a text."""
-    if len(text) <= _MOST_FAST:
-        return len(text)
-    # A block opens at a column of its own, which a list may share with its mapping, or behind a sign on the line.
-    blocks = (len(line) - len(line.lstrip(" ")) + line.count("-") + line.count("?") for line in _LINE_END.split(text))
-    return text.count("[") + text.count("{") + 2 * max(blocks) + 2
-
-
 def _measure(node: yaml.Node, depth: int, known: dict[int, tuple[int, int]]) -> tuple[int, int]:
     """Return the number of values and levels of a node, each alias counted where it is used.
 
@@ -197,7 +189,7 @@ def _measure(node: yaml.Node, depth: int, known: dict[int, tuple[int, int]]) -> 
     return size, levels
 
 
-def _refused(problem: str, node: yaml.Node) -> yaml.MarkedYAMLError:
+def _refused(problem: str, node: Any) -> yaml.MarkedYAMLError:
     return yaml.MarkedYAMLError(problem=problem, problem_mark=node.start_mark)
 
 

@@ -2,14 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from instant_ic.config.yaml_place import YamlProblem
 from instant_ic.util import paths
 
 HANG_TIMEOUT_S = 10.0
 """Default hang time-out: a node without a heartbeat for longer than this counts as hung."""
+
+
+class LaunchFileError(ValueError):
+    """A launch file or its includes have mistakes; ``problems`` lists them."""
+
+    def __init__(self, problems: Sequence[YamlProblem]) -> None:
+        super().__init__("\n".join(map(str, problems)))
+        self.problems = list(problems)
 
 
 @dataclass(frozen=True)

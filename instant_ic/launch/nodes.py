@@ -13,9 +13,9 @@ from pathlib import Path
 import yaml
 
 from instant_ic.config.scalars import Scalar, is_null
+from instant_ic.config.yaml_place import YamlPlace
 from instant_ic.config.yaml_text import one_line, read_spelled
 from instant_ic.launch.description import HANG_TIMEOUT_S, NodeSpec
-from instant_ic.launch.source import YamlPlace
 from instant_ic.launch.substitutions import LaunchContext, SubstitutionError, substitute, truth
 from instant_ic.util import paths
 
@@ -96,7 +96,7 @@ def read_node(body: YamlPlace, scope: Scope) -> NodeSpec | None:
     """Read a ``node``; None if its conditions do not hold.
 
     Raises:
-        LaunchProblem: the first mistake in it.
+        YamlProblem: the first mistake in it.
     """
     fields = body.fields(_NODE_KEYS, required=("exec",))
     executable = scope.text(fields["exec"])

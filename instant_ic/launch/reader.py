@@ -8,9 +8,9 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
-from instant_ic.launch.description import LaunchArgument, LaunchDescription, NodeSpec, find_launch_file
+from instant_ic.config.yaml_place import YamlPlace, YamlProblem, load
+from instant_ic.launch.description import LaunchArgument, LaunchDescription, LaunchFileError, NodeSpec, find_launch_file
 from instant_ic.launch.nodes import CONDITION, NODE_NAME, Scope, parameter_file, read_node
-from instant_ic.launch.source import LaunchFileError, LaunchProblem, YamlPlace, load
 from instant_ic.launch.substitutions import LaunchContext, truth
 from instant_ic.util import paths
 
@@ -29,7 +29,7 @@ class _FileReader:
     """
 
     def __init__(
-        self, nodes: list[NodeSpec], problems: list[LaunchProblem], given: Mapping[str, str], depth: int = 0
+        self, nodes: list[NodeSpec], problems: list[YamlProblem], given: Mapping[str, str], depth: int = 0
     ) -> None:
         self.arguments: dict[str, LaunchArgument] = {}
         self._nodes, self._problems, self._given, self._depth = nodes, problems, given, depth
@@ -46,7 +46,7 @@ class _FileReader:
         """Read the scope's file.
 
         Raises:
-            LaunchProblem: the file as a whole cannot be read.
+            YamlProblem: the file as a whole cannot be read.
         """
         self._entries(load(scope.context.launch_file).fields(("launch",), ("launch",))["launch"], scope)
 
@@ -58,7 +58,7 @@ class _FileReader:
                     raise entry.problem(f"each entry is one of {', '.join(self._actions)}")
                 [(action, value)] = fields.items()
                 self._actions[action](value, scope)
-            except LaunchProblem as problem:
+            except YamlProblem as problem:
                 self._problems.append(problem)
 
     def _arg(self, body: YamlPlace, scope: Scope) -> None:
@@ -166,16 +166,16 @@ def read_launch_file(
     """
     given = dict(arguments or {})
     nodes: list[NodeSpec] = []
-    problems: list[LaunchProblem] = []
+    problems: list[YamlProblem] = []
     scope = Scope(LaunchContext(file.resolve(), run_dir or paths.run_dir()))
     reader = _FileReader(nodes, problems, given)
     try:
         reader.read(scope)
-    except LaunchProblem as problem:
+    except YamlProblem as problem:
         problems.append(problem)
     have = ", ".join(sorted(reader.arguments)) or "none"
     problems += [
-        LaunchProblem(file, 1, f"there is no argument {name!r} (arguments: {have})")
+        YamlProblem(file, 1, f"there is no argument {name!r} (arguments: {have})")
         for name in given
         if name not in reader.arguments
     ]
@@ -194,5 +194,5 @@ def read_arguments(file: Path) -> tuple[LaunchArgument, ...]:
         entries = load(file).fields(("launch",), ("launch",))["launch"].items()
         bodies = [entry.fields()["arg"] for entry in entries if "arg" in entry.fields()]
         return tuple(_argument(body) for body in bodies)
-    except LaunchProblem as problem:
+    except YamlProblem as problem:
         raise LaunchFileError([problem]) from None

@@ -220,7 +220,7 @@ def test_the_mistakes_of_all_entries_at_once_with_their_lines(tmp_path: Path, pr
         ("launch:\n- node: {exec: " + 300 * "x" + ".py}\n", "does not exist beside the launch file"),
         ("launch:\n- let: {name: a, value: $(config " + 300 * "x" + ")}\n", "does not exist"),
         ('launch:\n- node: {exec: talker.py, param: [{name: a, value: [!!int "_"]}]}\n', "2: not YAML: string index"),
-        ("", "1: the file is empty"),
+        ("", "1: 'launch' is missing"),
         ("nodes: []\n", "1: unknown key 'nodes'"),
         ("launch:\n- node: {exec: talker.py}\n- node: {exec: talker.py}\n", "3: a node named 'talker'"),
         ("launch:\n- node: {exec: talker.py, name: a-b}\n", "2: node name 'a-b' is not legal"),

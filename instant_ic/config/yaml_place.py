@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -13,7 +13,7 @@ from instant_ic.config.yaml_text import compose_yaml, spelled
 _KINDS = {yaml.ScalarNode: "single value", yaml.SequenceNode: "list", yaml.MappingNode: "mapping"}
 
 
-class LaunchProblem(ValueError):
+class YamlProblem(ValueError):
     """One mistake in a file; printed as ``file:line: text``, which editors and terminals understand."""
 
     def __init__(self, file: Path, line: int, text: str) -> None:
@@ -21,17 +21,9 @@ class LaunchProblem(ValueError):
         self.file, self.line, self.text = file, line, text
 
 
-class LaunchFileError(ValueError):
-    """A launch file or its includes have mistakes; ``problems`` lists them."""
-
-    def __init__(self, problems: Sequence[LaunchProblem]) -> None:
-        super().__init__("\n".join(map(str, problems)))
-        self.problems = list(problems)
-
-
 @dataclass(frozen=True)
 class YamlPlace:
-    """A scalar, mapping or list in a YAML file. Reading it as another kind raises :class:`LaunchProblem`."""
+    """A scalar, mapping or list in a YAML file. Reading it as another kind raises :class:`YamlProblem`."""
 
     file: Path
     node: yaml.Node
@@ -56,15 +48,24 @@ class YamlPlace:
         """True if it is quoted or block text, which is never a number or a boolean."""
         return isinstance(self.node, yaml.ScalarNode) and bool(self.node.style)
 
-    def problem(self, text: str) -> LaunchProblem:
+    @property
+    def is_mapping(self) -> bool:
+        """True if it has keys and values."""
+        return isinstance(self.node, yaml.MappingNode)
+
+    @property
+    def _is_null(self) -> bool:
+        return bool(self.node.tag == "tag:yaml.org,2002:null")
+
+    def problem(self, text: str) -> YamlProblem:
         """Return the error for a mistake at this place."""
-        return LaunchProblem(self.file, self.line, text)
+        return YamlProblem(self.file, self.line, text)
 
     def text(self) -> str:
         """Return the scalar as it is written; empty for null."""
         if not self.is_single:
             raise self._unexpected("a single value")
-        return "" if self.node.tag == "tag:yaml.org,2002:null" else str(self.node.value)
+        return "" if self._is_null else str(self.node.value)
 
     def items(self) -> list[YamlPlace]:
         """Return the entries of a list."""
@@ -73,11 +74,14 @@ class YamlPlace:
         return [YamlPlace(self.file, entry) for entry in self.node.value]
 
     def fields(self, known: Collection[str] = (), required: Collection[str] = ()) -> dict[str, YamlPlace]:
-        """Return the entries of a mapping; a missing, a repeated or, with ``known``, an unknown key is a mistake."""
-        if not isinstance(self.node, yaml.MappingNode):
+        """Return the entries of a mapping; null has none.
+
+        A missing, a repeated or, with ``known``, an unknown key is a mistake.
+        """
+        if not self.is_mapping and not self._is_null:
             raise self._unexpected("keys and values")
         found: dict[str, YamlPlace] = {}
-        for key_node, value_node in self.node.value:
+        for key_node, value_node in self.node.value if self.is_mapping else ():
             key = YamlPlace(self.file, key_node)
             name = key.text()
             if name in found:
@@ -96,29 +100,28 @@ class YamlPlace:
         except yaml.YAMLError as error:
             raise self.problem(f"not YAML: {error}") from None
 
-    def _unexpected(self, wanted: str) -> LaunchProblem:
+    def _unexpected(self, wanted: str) -> YamlProblem:
         return self.problem(f"expected {wanted}, got a {_KINDS.get(type(self.node), 'value of another kind')}")
 
 
 def load(file: Path) -> YamlPlace:
-    """Read a YAML file.
+    """Read a YAML file; an empty one is null.
 
     Raises:
-        LaunchProblem: it cannot be read, is not YAML or is empty.
+        YamlProblem: it cannot be read, or is not YAML.
     """
     try:
         node = compose_yaml(file.read_text(encoding="utf-8"))
     except OSError as error:
-        raise LaunchProblem(file, 1, f"cannot be read: {error.strerror}") from None
+        raise YamlProblem(file, 1, f"cannot be read: {error.strerror}") from None
     except UnicodeDecodeError as error:
-        raise LaunchProblem(file, 1, f"cannot be read: {error}") from None
+        raise YamlProblem(file, 1, f"cannot be read: {error}") from None
     except yaml.YAMLError as error:
         mark = getattr(error, "problem_mark", None) or getattr(error, "context_mark", None)
         line = mark.line + 1 if mark else 1
-        raise LaunchProblem(file, line, f"not YAML: {getattr(error, 'problem', None) or error}") from None
-    if node is None:
-        raise LaunchProblem(file, 1, "the file is empty")
-    return YamlPlace(file, node)
+        raise YamlProblem(file, line, f"not YAML: {getattr(error, 'problem', None) or error}") from None
+    start = yaml.Mark(str(file), 0, 0, 0, None, 0)
+    return YamlPlace(file, node or yaml.ScalarNode("tag:yaml.org,2002:null", "", start))
 
 
 def _shortened(file: Path) -> Path:
