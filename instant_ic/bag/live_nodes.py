@@ -36,10 +36,10 @@ class LiveTopics:
         self._watch = TopicWatch(run_dir)
         self._next_nodes_s = 0.0
 
-    def look(self, again: bool = False) -> tuple[list[TopicInfo], list[NodeInfo]]:
-        """Return the topics with a publisher, and the nodes if they are due or ``again`` is set."""
+    def look(self) -> tuple[list[TopicInfo], list[NodeInfo]]:
+        """Return the topics with a publisher, and the nodes if they are due."""
         nodes: list[NodeInfo] = []
-        if again or time.monotonic() >= self._next_nodes_s:
+        if time.monotonic() >= self._next_nodes_s:
             self._next_nodes_s = time.monotonic() + _NODES_S
             nodes = list_nodes(self._run_dir)
         return self._watch.topics(), nodes

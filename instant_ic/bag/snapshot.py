@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-import logging
 from collections import deque
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 from instant_ic.bag.latched import LatchedValues
-from instant_ic.bag.message import BagError, BagMessage
-from instant_ic.bag.writer import BagWriter
-
-log = logging.getLogger(__name__)
+from instant_ic.bag.message import BagMessage
+from instant_ic.bag.recording import Recording
 
 
 @dataclass
@@ -20,15 +16,29 @@ class BagSnapshot:
     """One snapshot.
 
     Attributes:
-        state: ``waiting``, ``writing``, ``done`` or ``failed``.
-        words: content of the bag, or why it failed.
         due_s: time at which it is written, by the monotonic clock.
+        recording: its bag, once it is being written.
+        text: content of the bag, or why it cannot be written.
     """
 
     path: Path
-    state: str = "waiting"
-    words: str = ""
-    due_s: float = 0.0
+    due_s: float
+    recording: Recording | None = None
+    text: str = ""
+
+    @property
+    def state(self) -> str:
+        """``waiting``, ``writing``, ``done`` or ``failed``."""
+        if self.recording is None:
+            return "failed" if self.text else "waiting"
+        if not self.recording.done:
+            return "writing"
+        return "failed" if self.recording.error else "done"
+
+    def status(self) -> dict[str, str]:
+        """Return the values that ``ic bag snapshot`` asks for."""
+        error = self.recording.error if self.recording is not None else ""
+        return {"path": str(self.path), "state": self.state, "text": error or self.text}
 
 
 class SnapshotCache:
@@ -61,31 +71,21 @@ class SnapshotCache:
         """Seconds between the oldest and the newest message."""
         return self._entries[-1][0] - self._entries[0][0] if self._entries else 0.0
 
+    def latched(self) -> list[BagMessage]:
+        """Return the current value of each latched topic."""
+        values = LatchedValues()
+        for message in [*self._before.values(), *(entry for _, entry in self._entries if entry.qos.latched)]:
+            values.put(message)
+        return values.values()
+
     def content(self) -> list[BagMessage]:
-        """Return the messages, oldest first, preceded by the latched values valid at their start, with that stamp."""
+        """Return the messages, oldest first, preceded by the latched values valid at their start.
+
+        No latched value has a stamp before that of the first other message.
+        """
         entries = [entry for _, entry in self._entries]
-        if not entries:
-            return []
-        begin_ns = min(entry.stamp_ns for entry in entries)
-        return [replace(value, stamp_ns=begin_ns) for value in self._before.values()] + entries
-
-
-def save_snapshot(
-    snapshot: BagSnapshot, content: list[BagMessage], compressed: bool, set_custom: Callable[[BagWriter], None]
-) -> bool:
-    """Write a snapshot; return whether it was written. An error concerns this snapshot only; the next may succeed."""
-    try:
-        if not content:
-            raise BagError(f"snapshot {snapshot.path}: no message has been received yet")
-        with BagWriter(snapshot.path, compressed) as writer:
-            for entry in content:
-                writer.write(entry.topic, entry.type_name, entry.payload, entry.stamp_ns, entry.qos)
-            set_custom(writer)
-    except BagError as error:
-        snapshot.words, snapshot.state = str(error), "failed"
-        log.error("%s", error)
-        return False
-    span_s = (max(e.stamp_ns for e in content) - min(e.stamp_ns for e in content)) / 1e9
-    snapshot.words, snapshot.state = f"{len(content)} messages, {span_s:.1f} s", "done"
-    log.info("snapshot %s: %s", snapshot.path, snapshot.words)
-    return True
+        stamps_ns = [entry.stamp_ns for entry in entries if not entry.qos.latched] or [e.stamp_ns for e in entries]
+        return [
+            replace(message, stamp_ns=max(message.stamp_ns, min(stamps_ns))) if message.qos.latched else message
+            for message in (*self._before.values(), *entries)
+        ]

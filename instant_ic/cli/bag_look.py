@@ -22,7 +22,6 @@ BOOKMARKS, _STRING = "/operator/bookmark", "std_msgs/msg/String"
 _LEFT_OUT = {
     "overflow": "left out because the disk was too slow",
     "disk_full": "left out while the disk was full",
-    "paused": "left out while paused",
 }
 
 
@@ -85,7 +84,7 @@ def _info(reader: BagReader) -> dict[str, Any]:
         return value
 
     span_s = (reader.end_ns - reader.start_ns) / 1e9
-    lost, lost_by = custom("lost"), custom("lost_by")
+    lost_by = custom("lost_by")
     return {
         "path": str(reader.path),
         "bytes": sum(file.stat().st_size for file in reader.files),
@@ -111,7 +110,7 @@ def _info(reader: BagReader) -> dict[str, Any]:
                 "messages": topic.count,
                 "rate_hz": (topic.count - 1) / span_s if topic.count > 1 and span_s > 0 else 0.0,
                 "qos": topic.qos.name,
-                "lost": lost.get(topic.topic, 0),
+                "lost": sum(lost_by.get(topic.topic, {}).values()),
                 "lost_by": lost_by.get(topic.topic, {}),
             }
             for topic in reader.topics

@@ -76,10 +76,10 @@ def snapshot(args: argparse.Namespace) -> int:
     while time.monotonic() < deadline_s:
         made = next(s for s in _call(recorder, "status")["snapshots"] if s["path"] == path)
         if made["state"] == "done":
-            print(f"{path}: {made['words']}")
+            print(f"{path}: {made['text']}")
             return 0
         if made["state"] == "failed":
-            raise UserError(made["words"])
+            raise UserError(made["text"])
         time.sleep(0.1)
     raise UserError(f"{node.name} did not write {path} within {args.timeout:g} s")
 
@@ -87,7 +87,7 @@ def snapshot(args: argparse.Namespace) -> int:
 def control(args: argparse.Namespace) -> int:
     arguments = argument_of(args.command, args.value)
     on_request = args.command in ("record", "stop")
-    kinds = ("bag_player",) if arguments else ("bag_recorder",) if on_request else _STEERED
+    kinds = _STEERED if args.command == "status" else ("bag_recorder",) if on_request else ("bag_player",)
     node = _node(kinds, args.node, keeps_snapshots=on_request)
     result = _call(NodeControl(run_dir(), node.name), args.command, **arguments)
     if args.command == "status":

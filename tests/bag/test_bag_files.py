@@ -115,7 +115,6 @@ def test_what_cannot_be_done_is_told(tmp_path: Path, action: object, message: st
 
 class Losses:
     def __init__(self) -> None:
-        self.lost = 0
         self.lost_by: dict[str, int] = {}
 
 
@@ -138,7 +137,7 @@ def test_recorder_files_old_latched_values_under_the_beginning(tmp_path: Path) -
     recorder.take("/scan", SCAN, b"first", 1000)
     recorder.take("/scan", SCAN, b"second", 1100)
     recorder.take("/scan", SCAN, b"no clock yet", 0)
-    counters["/scan"].lost = 4
+    counters["/scan"].lost_by = {"front": 4}
     recorder.close()
     with BagReader(tmp_path / "bag") as reader:
         assert [(m.topic, m.stamp_ns, m.payload) for m in reader.messages()] == [
@@ -147,7 +146,7 @@ def test_recorder_files_old_latched_values_under_the_beginning(tmp_path: Path) -
             ("/scan", 1100, b"second"),
         ]
         assert {t.topic: t.qos.name for t in reader.topics} == {"/estop": "latched", "/scan": "sensor"}
-        assert json.loads(reader.custom["instant_ic.lost"]) == {"/scan": 4}
+        assert json.loads(reader.custom["instant_ic.lost_by"]) == {"/scan": {"front": 4}}
 
 
 def test_recorder_on_simulated_time_gives_foreign_stamps_its_own(tmp_path: Path) -> None:

@@ -103,11 +103,6 @@ def status(talker: Talker) -> dict[str, object]:
     return json.loads(done.stdout) if done.returncode == 0 else {}
 
 
-def left_out(talker: Talker) -> int:
-    """Messages that a paused recorder has received."""
-    return sum(status(talker).get("paused", {}).values())
-
-
 def test_killed_recorder_loses_at_most_what_it_had_not_flushed(talker: Talker, tmp_path: Path) -> None:
     process = talker.start("bag", "record", "-o", tmp_path / "bag", "/count", "-d", "1")
     try:
@@ -153,8 +148,9 @@ def test_snapshots_on_demand_and_at_an_emergency_stop(talker: Talker, tmp_path: 
     assert process.returncode == 0, text
     (asked,), (stopped,), (recorded,) = folder.glob("*_door_stuck"), folder.glob("*_estop"), folder.glob("rec_*")
     with BagReader(recorded) as reader:
-        topics = {t.topic: t for t in reader.topics}
-        assert topics["/operator/estop"].count == 1  # latched long before
+        # Latched before the recording began; the recorder may have read the value before it a moment earlier.
+        stops = [deserialize(m.payload, m.type_name).data for m in reader.messages({"/operator/estop"})]
+        assert stops in ([True], [False, True])
         values = [deserialize(m.payload, m.type_name).data for m in reader.messages({"/count"})]
         assert len(values) >= 20 and values == [values[0] + i for i in range(len(values))]
     with BagReader(asked) as reader:

@@ -9,15 +9,15 @@ import time
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 import pytest
 
-from instant_ic.bag import BagError, BagMessage, BagReader
-from instant_ic.bag import recorder_thread as recording
+from instant_ic.bag import BagError, BagMessage, BagReader, recording
 from instant_ic.bag.choice import TopicChoice
 from instant_ic.bag.mcap_scan import McapScan
 from instant_ic.bag.recorder import BagRecorderConfig, Recorder
-from instant_ic.bag.recorder_thread import DISK_FULL, FAILED, PAUSED, RECORDING
+from instant_ic.bag.recording import DISK_FULL, FAILED, RECORDING, Recording
 from instant_ic.bag.snapshot import SnapshotCache
 from instant_ic.bus import LATCHED, SENSOR
 from instant_ic.bus.qos import QoS
@@ -38,7 +38,6 @@ def quick_recorder(monkeypatch: pytest.MonkeyPatch) -> None:
 
 class Losses:
     def __init__(self) -> None:
-        self.lost = 0
         self.lost_by: dict[str, int] = {}
 
 
@@ -47,17 +46,22 @@ def topic_info(topic: str, *presets: QoS) -> TopicInfo:
     return TopicInfo(topic, BOOL, publishers)
 
 
-def make(path: Path, free: Callable[[Path], int] = lambda path: 10**12, **options: object) -> Recorder:
-    recorder = Recorder(
-        path,
-        TopicChoice(),
-        lambda topic, take: Losses(),
-        None,
-        BagRecorderConfig(**options),
-        free,  # type: ignore[arg-type]
-    )
+def recorder_of(
+    path: Path, free: Callable[[Path], int] = lambda path: 10**12, losses: Losses | None = None, **options: object
+) -> Recorder:
+    """A recorder that has found two topics."""
+    config = BagRecorderConfig(**options)  # type: ignore[arg-type]
+    recorder = Recorder(path, TopicChoice(), lambda topic, take: losses or Losses(), None, config, free)  # type: ignore[arg-type, return-value]
     recorder.discover([topic_info("/scan", SENSOR), topic_info("/estop", LATCHED)])
     return recorder
+
+
+def make(
+    path: Path, free: Callable[[Path], int] = lambda path: 10**12, **options: object
+) -> tuple[Recorder, Recording]:
+    recorder = recorder_of(path, free, **options)
+    assert recorder.bag is not None
+    return recorder, recorder.bag
 
 
 def wait_for(condition: Callable[[], object], what: str) -> None:
@@ -97,7 +101,7 @@ class SlowDisk:
 def test_taking_never_waits_for_the_disk_and_what_is_left_out_is_told(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    recorder, disk = make(tmp_path / "bag", queue_mb=3), SlowDisk(monkeypatch)
+    (recorder, bag), disk = make(tmp_path / "bag", queue_mb=3), SlowDisk(monkeypatch)
     recorder.take("/scan", BOOL, b"first", 1 * S)
     disk.hang()
     # Twenty times 1 MB while the disk takes nothing: three find a place in the queue, some are in the writer's hands.
@@ -105,7 +109,7 @@ def test_taking_never_waits_for_the_disk_and_what_is_left_out_is_told(
         recorder.take("/scan", BOOL, bytes([index]) * 1_000_000, 2 * S + index)
     recorder.take("/estop", BOOL, YES, 3 * S)  # latched values always find a place
     assert not disk.go.is_set()  # and all that time nothing was written
-    left_out = recorder.dropped.overflow["/scan"]
+    left_out = bag.overflow["/scan"]
     assert 10 <= left_out <= 18
     disk.go.set()
     recorder.close()
@@ -116,7 +120,7 @@ def test_taking_never_waits_for_the_disk_and_what_is_left_out_is_told(
 
 
 def test_a_disk_that_hangs_for_good_does_not_hang_the_end(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    recorder, disk = make(tmp_path / "bag"), SlowDisk(monkeypatch)
+    (recorder, _), disk = make(tmp_path / "bag"), SlowDisk(monkeypatch)
     disk.hang()
     recorder.take("/scan", BOOL, b"x" * 2_000_000, 1 * S)
     recorder.take("/estop", BOOL, YES, 2 * S)
@@ -126,7 +130,7 @@ def test_a_disk_that_hangs_for_good_does_not_hang_the_end(tmp_path: Path, monkey
 
 
 def test_payload_may_be_overwritten_once_it_was_taken(tmp_path: Path) -> None:
-    recorder = make(tmp_path / "bag")
+    recorder, _ = make(tmp_path / "bag")
     slot = bytearray(b"aaaa")  # as in shared memory
     recorder.take("/scan", BOOL, memoryview(slot), 1 * S)
     slot[:] = b"bbbb"
@@ -134,70 +138,58 @@ def test_payload_may_be_overwritten_once_it_was_taken(tmp_path: Path) -> None:
     assert read(tmp_path / "bag") == [("/scan", 1 * S, b"aaaa")]
 
 
-def test_pause_keeps_latched_values_for_its_end(tmp_path: Path) -> None:
-    recorder = make(tmp_path / "bag")
-    recorder.take("/scan", BOOL, b"1", 1 * S)
-    recorder.pause()
-    assert recorder.state == PAUSED
-    recorder.take("/scan", BOOL, b"2", 2 * S)
-    recorder.take("/estop", BOOL, NO, 2 * S)
-    recorder.take("/estop", BOOL, YES, 3 * S)
-    assert recorder.status()["paused"] == {"/scan": 1, "/estop": 2}
-    recorder.resume()
-    recorder.take("/scan", BOOL, b"4", 4 * S)
-    recorder.close()
-    assert read(tmp_path / "bag") == [("/scan", 1 * S, b"1"), ("/estop", 3 * S, YES), ("/scan", 4 * S, b"4")]
-    assert custom(tmp_path / "bag", "paused") == {"/scan": 1, "/estop": 2}
-
-
 def test_reserve_of_the_disk_ends_the_file_and_recording_goes_on_when_there_is_room(tmp_path: Path) -> None:
-    free = [10**12]
-    recorder = make(tmp_path / "bag", lambda path: free[0], min_free_mb=1000)
+    free, looks = [10**12], [0]
+
+    def free_bytes(path: Path) -> int:
+        looks[0] += 1
+        return free[0]
+
+    recorder, bag = make(tmp_path / "bag", free_bytes, min_free_mb=1000)
     recorder.take("/scan", BOOL, b"1", 1 * S)
-    wait_for(lambda: recorder.count == 1, "the first message")
+    wait_for(lambda: bag.status()["messages"] == 1, "the first message")
     free[0] = 900_000_000
-    wait_for(lambda: recorder.state == DISK_FULL, "the full disk")
-    assert "only 900 MB are free" in recorder.error and recorder.failed
+    wait_for(lambda: bag.state == DISK_FULL, "the full disk")
+    assert "only 900 MB are free" in bag.error and recorder.failed
     # The bag is complete and opens although the recorder still runs.
     assert read(tmp_path / "bag") == [("/scan", 1 * S, b"1")]
     recorder.take("/scan", BOOL, b"2", 2 * S)
     recorder.take("/estop", BOOL, YES, 3 * S)
-    free[0] = 1_063_000_000  # a little above the reserve: not yet, or it would come and go
-    time.sleep(0.4)
-    assert recorder.state == DISK_FULL
+    free[0], before = 1_063_000_000, looks[0]  # a little above the reserve: not yet, or it would come and go
+    wait_for(lambda: looks[0] >= before + 3, "two looks at the new space")
+    assert bag.state == DISK_FULL
     free[0] = 2_000_000_000
-    wait_for(lambda: recorder.state == RECORDING, "room")
-    recorder.tick()
+    wait_for(lambda: bag.state == RECORDING, "room")
     recorder.take("/scan", BOOL, b"4", 4 * S)
     recorder.close()
-    assert read(tmp_path / "bag") == [("/scan", 1 * S, b"1"), ("/estop", 3 * S, YES), ("/scan", 4 * S, b"4")]
+    # The next file begins with the latched value that was missed.
+    assert read(tmp_path / "bag") == [("/scan", 1 * S, b"1"), ("/estop", 4 * S, YES), ("/scan", 4 * S, b"4")]
     assert custom(tmp_path / "bag", "disk_full") == {"/scan": 1, "/estop": 1}
 
 
 def test_folder_taken_away_is_told(tmp_path: Path) -> None:
-    recorder = make(tmp_path / "bag", free=lambda path: shutil.disk_usage(path).free)
+    recorder, bag = make(tmp_path / "bag", free=lambda path: shutil.disk_usage(path).free)
     recorder.take("/scan", BOOL, b"1", 1 * S)
     shutil.rmtree(tmp_path / "bag")
-    wait_for(lambda: recorder.state == FAILED, "the failure")
-    assert "its folder was removed" in recorder.error
+    wait_for(lambda: bag.state == FAILED, "the failure")
+    assert "its folder was removed" in bag.error
     with pytest.raises(BagError, match="was removed"):
         recorder.close()
 
 
 def test_losses_are_a_warning_only_while_they_grow(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     losses = Losses()
-    recorder = Recorder(tmp_path / "bag", TopicChoice(), lambda topic, take: losses)
-    recorder.discover([topic_info("/scan", SENSOR)])
+    recorder = recorder_of(tmp_path / "bag", losses=losses)
     second = 0.0
     monkeypatch.setattr("instant_ic.bag.recorder.time.monotonic_ns", lambda: int(second * S))
 
     def level() -> int:
         (found,) = recorder.diagnoses()
-        assert ("lost: /scan 5" in found.text) is (losses.lost == 5), found.text
+        assert ("lost: /estop 5, /scan 5" in found.text) is bool(losses.lost_by), found.text
         return found.level
 
     assert level() == Level.OK
-    losses.lost = 5
+    losses.lost_by = {"front": 5}
     assert level() == Level.WARN
     second = 11.0
     assert level() == Level.OK
@@ -225,7 +217,7 @@ def test_snapshot_cache_keeps_the_last_seconds_and_what_was_latched_before() -> 
 
 
 def test_snapshots_are_bags_of_their_own(tmp_path: Path) -> None:
-    recorder = make(tmp_path / "snaps", snapshot=True, snapshot_seconds=60.0)
+    recorder = recorder_of(tmp_path / "snaps", snapshot=True, snapshot_seconds=60.0)
     recorder.take("/estop", BOOL, NO, 1 * S)
     recorder.take("/scan", BOOL, b"1", 2 * S)
     first = recorder.snapshot("door / stuck!")
@@ -239,14 +231,14 @@ def test_snapshots_are_bags_of_their_own(tmp_path: Path) -> None:
     assert [(m[0], m[2]) for m in read(first.path)] == [("/estop", NO), ("/scan", b"1")]
     assert [(m[0], m[2]) for m in read(second.path)][-1] == ("/estop", YES)
     assert [m[2] for m in read(second.path) if m[0] == "/scan"] == [b"1", b"2"]
-    assert second.state == "done" and second.words == "4 messages, 2.0 s"
+    assert second.state == "done" and second.text == "4 messages, 2.0 s"
 
 
 def test_snapshot_that_cannot_be_written_is_told_and_the_next_succeeds(tmp_path: Path) -> None:
-    recorder = make(tmp_path / "snaps", snapshot=True, snapshot_seconds=60.0)
+    recorder = recorder_of(tmp_path / "snaps", snapshot=True, snapshot_seconds=60.0)
     empty = recorder.snapshot("early")
     wait_for(lambda: empty.state == "failed", "the failure")
-    assert "no message has been received yet" in empty.words
+    assert "no message has been received yet" in empty.text
     recorder.take("/scan", BOOL, b"1", 2 * S)
     good = recorder.snapshot("late")
     wait_for(lambda: good.state == "done", "the snapshot")
@@ -266,7 +258,7 @@ def test_every_message_is_recorded_or_counted_whatever_the_disk_refuses(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: int, size: int, end_fits: bool
 ) -> None:
     """On a full disk the messages of the chunk that was being written were neither."""
-    recorder = make(tmp_path / "bag")
+    recorder, bag = make(tmp_path / "bag")
     refused = threading.Event()
     write = os.write
 
@@ -283,19 +275,19 @@ def test_every_message_is_recorded_or_counted_whatever_the_disk_refuses(
     refused.set()
     for index in range(40, 80):
         recorder.take("/scan", BOOL, sent[index], index + S)
-    wait_for(lambda: recorder.error, "the refusal")
+    wait_for(lambda: bag.error, "the refusal")
     refused.clear()
-    if recorder.state == DISK_FULL:
-        wait_for(lambda: recorder.state == RECORDING, "room")
+    if bag.state == DISK_FULL:
+        wait_for(lambda: bag.state == RECORDING, "room")
     for index in range(80, 120):
         recorder.take("/scan", BOOL, sent[index], index + S)
     with suppress(BagError):
         recorder.close()
     found = on_the_disk(tmp_path / "bag")
-    lost = recorder.status()["disk_full"]["/scan"]
+    lost = bag.not_written["/scan"]
     assert lost > 0 and len(found) + lost == 120 and set(found) <= set(sent)
     assert custom(tmp_path / "bag", "disk_full") == {"/scan": lost}
-    assert not recorder.error or f"not recorded: /scan {lost}" in recorder.error
+    assert not bag.error or f"not recorded: /scan {lost}" in bag.error
 
 
 class Syncs:
@@ -321,10 +313,73 @@ def test_bag_is_on_the_disk_itself_at_its_end_and_meanwhile(tmp_path: Path, monk
     monkeypatch.setattr(recording, "SYNC_S", 0.05)
     syncs = Syncs(monkeypatch)
     bag = tmp_path / "bag"
-    recorder = make(bag)
+    recorder, _ = make(bag)
     recorder.take("/scan", BOOL, b"1" * 100, S)
     wait_for(lambda: len(on_the_disk(bag)) == 1 and syncs.hold(bag / "bag.mcap"), "the message on the disk")
     wait_for(lambda: syncs.hold(bag), "the folder that knows the file")
     recorder.take("/scan", BOOL, b"2" * 100, 2 * S)
     recorder.close()
     assert all(syncs.hold(path) for path in (bag, bag / "bag.mcap", bag / "metadata.yaml"))
+
+
+# -- recordings on request, in snapshot mode ------------------------------------------------------------------------
+
+
+def test_recordings_on_request_begin_end_and_begin_again(tmp_path: Path) -> None:
+    losses = Losses()
+    recorder = recorder_of(tmp_path, losses=losses, snapshot=True)
+
+    def recording_status() -> dict[str, Any]:
+        return recorder.status()["recording"]
+
+    assert recording_status()["state"] == "idle" and recording_status()["free_bytes"] > 0
+    with pytest.raises(ValueError, match="nothing is being recorded"):
+        recorder.stop()
+    recorder.take("/estop", BOOL, YES, 1 * S)  # long before: the bag begins with it
+    recorder.take("/scan", BOOL, b"1", 2 * S)
+    losses.lost_by = {"front": 5}
+    first = recorder.record("door / stuck!")
+    assert first.parent == tmp_path and first.name.startswith("rec_") and first.name.endswith("_door___stuck")
+    with pytest.raises(ValueError, match="is being recorded already"):
+        recorder.record()
+    losses.lost_by = {"front": 7}
+    for second in (3, 4, 5):
+        recorder.take("/scan", BOOL, bytes([second]), second * S)
+    wait_for(lambda: recording_status()["messages"] == 4, "the messages")
+    assert recording_status()["state"] == "recording"
+    assert [d.level for d in recorder.diagnoses()] == [Level.WARN]  # of the losses
+    assert recorder.stop() == first
+    recorder.take("/scan", BOOL, b"6", 6 * S)
+    with pytest.raises(ValueError, match="nothing is being recorded"):
+        recorder.stop()
+    wait_for(lambda: recording_status()["state"] == "idle", "the end")
+    status = recording_status()
+    assert (status["path"], status["messages"], status["error"]) == (str(first), 4, "") and status["bytes"] > 0
+    assert read(first) == [("/estop", 3 * S, YES), *(("/scan", s * S, bytes([s])) for s in (3, 4, 5))]
+    assert custom(first, "lost_by") == {"/scan": {"front": 2}, "/estop": {"front": 2}}  # since it began
+    second = recorder.record("door / stuck!")
+    assert second != first
+    recorder.close()
+    assert (second / "metadata.yaml").exists()
+
+
+def test_a_full_disk_is_told_while_a_recording_on_request_waits_and_when_it_ends(tmp_path: Path) -> None:
+    recorder = recorder_of(tmp_path, lambda path: 1_000_000, snapshot=True)
+    recorder.record()
+    recorder.take("/scan", BOOL, YES, 1 * S)
+    wait_for(lambda: recorder.status()["recording"]["state"] == DISK_FULL, "the full disk")
+    (found,) = recorder.diagnoses()
+    assert found.level == Level.ERROR and "only 1 MB are free" in found.text
+    recorder.stop()
+    wait_for(lambda: recorder.status()["recording"]["state"] == "idle", "the end")
+    assert "only 1 MB are free" in recorder.status()["recording"]["error"]
+    recorder.close()
+    assert recorder.failed
+
+
+def test_a_recorder_of_one_bag_refuses_requests(tmp_path: Path) -> None:
+    recorder, _ = make(tmp_path / "bag")
+    for request in (recorder.record, recorder.stop, recorder.snapshot):
+        with pytest.raises(ValueError, match="start it with --snapshot"):
+            request()
+    recorder.close()

@@ -7,7 +7,7 @@ import { byId, mark, write } from "./dom.js";
 import { announce, toast } from "./hud.js";
 import { bytesText, recorderText, recordText } from "./texts.js";
 
-const RUNNING = ["recording", "disk full", "paused"];
+const RUNNING = ["recording", "disk full"];
 
 /** @type {RecordingStatus} */
 const NO_ANSWER = {

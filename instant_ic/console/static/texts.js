@@ -94,7 +94,7 @@ export function bannerText({ lost, estop, held, driver, reason }) {
 }
 
 /** @type {Record<string, string>} Button text in states of the recorder other than recording. */
-const RECORDER = { ending: "Saving…", "disk full": "Disk full", failed: "Failed", paused: "Paused" };
+const RECORDER = { ending: "Saving…", "disk full": "Disk full", failed: "Failed" };
 
 /** Text of the record button. @param {RecordingStatus} status */
 export const recordText = (status) =>

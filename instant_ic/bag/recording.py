@@ -1,0 +1,328 @@
+"""One bag being written by a thread of its own, so that the node never waits for the disk.
+
+Messages go into a queue bounded by bytes. The thread writes them, watches the free space of the disk and completes the
+bag. Whatever does not reach the disk is counted by topic: ``overflow`` where the queue was full, ``not_written`` where
+the disk was full or failed.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import shutil
+import threading
+import time
+from collections import Counter, deque
+from collections.abc import Callable, Collection, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from instant_ic.bag.message import BagError, BagMessage, DiskFullError
+from instant_ic.bag.writer import BagWriter
+from instant_ic.config.ranges import Checked, NotNegative, NotNegativeInt, PositiveInt
+
+FLUSH_S = 1.0
+"""Longest time of the recording that a killed recorder loses."""
+
+SYNC_S = 5.0
+"""Longest time of the recording that a power failure loses, beside what the disk itself holds back."""
+
+SPACE_S = 1.0
+"""Seconds between two looks at the free space of the disk."""
+
+RECORDING, DISK_FULL, FAILED, ENDING, ENDED = "recording", "disk full", "failed", "ending", "ended"
+
+_MB = 1_000_000
+_KEEP_CUSTOM_S = 10.0
+_ROOM_AGAIN = 64_000_000  # free space above the reserve before recording restarts
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class BagOptions(Checked):
+    """How a bag is written.
+
+    Attributes:
+        compressed: compress with zstd.
+        max_bag_size: size in bytes at which the next file begins; 0 writes one file.
+        max_bag_duration: length in seconds at which the next file begins; 0 writes one file.
+        queue_mb: largest queue for the disk, MB; messages beyond it are dropped and counted.
+        min_free_mb: stop recording when the disk has less free space, MB.
+    """
+
+    compressed: bool = False
+    max_bag_size: NotNegativeInt = 0
+    max_bag_duration: NotNegative = 0.0
+    queue_mb: PositiveInt = 256
+    min_free_mb: NotNegativeInt = 100
+
+
+class Recording:
+    """A bag that is being written. Only the node's thread calls it.
+
+    Args:
+        path: folder of the bag, which must not exist.
+        custom: returns the values to store with the bag, by name.
+        content: messages of the past, oldest first, that are written whatever the size of the queue.
+        free_bytes: free space on the disk of a folder; replaced in tests.
+
+    Attributes:
+        overflow: messages by topic that found no place in the queue.
+        failed: whether an error occurred since the start.
+
+    Raises:
+        BagError: the bag cannot be created.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        options: BagOptions,
+        custom: Callable[[], Mapping[str, Any]],
+        content: Collection[BagMessage] = (),
+        free_bytes: Callable[[Path], int] = lambda path: shutil.disk_usage(path).free,
+    ) -> None:
+        self.path = path
+        self.overflow: Counter[str] = Counter()
+        self.failed = False
+        self._state = RECORDING
+        self._custom = custom
+        self._free_bytes = free_bytes
+        self._max_bytes = options.queue_mb * _MB
+        self._reserve = options.min_free_mb * _MB
+        self._writer = BagWriter(path, options.compressed, options.max_bag_size, options.max_bag_duration)
+        self._begun_s, self._ended_s = time.monotonic(), 0.0
+        self._report = True
+        self._begun_ns = 0
+        self._held: list[BagMessage] = []
+        self._error = ""
+        self._skipped: Counter[str] = Counter()  # replaced, never changed: another thread reads it
+        self._queue = deque(content)
+        self._pending = len(content)  # queued, or in the hands of the thread
+        self._pending_bytes = sum(len(message.payload) for message in content)
+        self._changed = threading.Condition()
+        self._thread = threading.Thread(target=self._run, name="bag writer", daemon=True)
+        self._thread.start()
+
+    # -- the node's thread -------------------------------------------------------------------------
+
+    @property
+    def state(self) -> str:
+        """``recording``, ``disk full``, ``failed``, ``ending`` or ``ended``."""
+        return ENDING if self._ended_s and not self.done else self._state
+
+    @property
+    def done(self) -> bool:
+        """True once the bag is complete, or given up."""
+        return not self._thread.is_alive()
+
+    @property
+    def not_written(self) -> Counter[str]:
+        """Messages by topic that were lost because the disk was full, or failed."""
+        return self._skipped + self._writer.lost
+
+    @property
+    def error(self) -> str:
+        """Why recording failed or waits, and what was lost by that; empty when all is well."""
+        gone = self.not_written if self._error else None
+        return f"{self._error}; not recorded: {counts_text(gone)}" if gone else self._error
+
+    @property
+    def unknown_types(self) -> dict[str, str]:
+        """Types recorded without a definition, with one of their topics each."""
+        return dict(self._writer.unknown_types)
+
+    def put(self, message: BagMessage) -> None:
+        """Queue a message; never waits. Latched values before the first other message get its stamp."""
+        if self._ended_s:
+            return
+        if not self._begun_ns:
+            if message.qos.latched:  # the value may be minutes old
+                self._held.append(message)
+                return
+            self._begin(message.stamp_ns)
+        self._enqueue(message)
+
+    def finish(self, report: bool = True) -> None:
+        """Stop taking messages; the thread writes what is queued, and completes the bag.
+
+        Args:
+            report: report the end in the log.
+        """
+        if self._ended_s:
+            return
+        if self._held:
+            self._begin(max(message.stamp_ns for message in self._held))
+        self._report = report
+        with self._changed:
+            self._ended_s = time.monotonic()
+            self._changed.notify()
+
+    def close(self, timeout_s: float = 30.0) -> None:
+        """Complete the bag and wait for it.
+
+        Raises:
+            BagError: the bag could not be written completely.
+        """
+        self.finish(report=False)
+        self._thread.join(timeout_s)
+        if not self.done:
+            raise BagError(
+                f"bag {self.path}: the disk did not take the last {self._pending} messages "
+                f"({self._pending_bytes / 1e6:.1f} MB) within {timeout_s:g} s; ic bag recover {self.path}"
+            )
+        if self._state == FAILED:
+            raise BagError(self.error)
+
+    def status(self) -> dict[str, Any]:
+        """Return the values that ``ic bag control status`` shows."""
+        return {
+            "path": str(self.path),
+            "state": self.state,
+            "error": self.error,
+            "seconds": round((self._ended_s or time.monotonic()) - self._begun_s, 1),
+            "messages": self._writer.count,
+            "bytes": self._writer.bytes,
+            "files": self._writer.files,
+            "queued_bytes": self._pending_bytes,
+            "overflow": dict(self.overflow),
+            "disk_full": dict(self.not_written),
+        }
+
+    def _begin(self, stamp_ns: int) -> None:
+        self._begun_ns = stamp_ns
+        held, self._held = self._held, []
+        for message in held:
+            self._enqueue(message)
+
+    def _enqueue(self, message: BagMessage) -> None:
+        """Queue a message, or count it if it does not fit; latched messages always fit."""
+        if message.qos.latched:
+            message = replace(message, stamp_ns=max(message.stamp_ns, self._begun_ns))
+        size = len(message.payload)
+        with self._changed:
+            if not message.qos.latched and self._pending_bytes + size > self._max_bytes:
+                self.overflow[message.topic] += 1
+                return
+            self._queue.append(message)
+            self._pending_bytes += size
+            self._pending += 1
+            self._changed.notify()
+
+    # -- the writing thread ------------------------------------------------------------------------
+
+    def _run(self) -> None:
+        now = time.monotonic()
+        due_s = {"space": now, "flush": now, "custom": now + _KEEP_CUSTOM_S, "sync": now + SYNC_S}
+        while True:
+            with self._changed:
+                self._changed.wait_for(lambda: self._queue or self._ended_s, SPACE_S)
+                message = self._queue.popleft() if self._queue else None
+            if message is None and self._ended_s:
+                break
+            try:
+                self._work(due_s)
+                if message is not None:
+                    self._write(message)
+            except DiskFullError as error:
+                self._fail(DISK_FULL, str(error))
+            except BagError as error:
+                self._fail(FAILED, str(error))
+            except Exception as error:  # a bug here must not leave a recorder that only appears to record
+                log.exception("bag writer")
+                self._fail(FAILED, f"{type(error).__name__}: {error}")
+            if message is not None:
+                with self._changed:
+                    self._pending -= 1
+                    self._pending_bytes -= len(message.payload)
+        self._complete()
+
+    def _write(self, message: BagMessage) -> None:
+        if self._state != RECORDING:
+            self._skipped = self._skipped + Counter([message.topic])
+            if message.qos.latched:
+                self._writer.remember(message)
+            return
+        stamp_ns, qos = message.stamp_ns, message.qos
+        self._writer.write(
+            message.topic, message.type_name, message.payload, stamp_ns, qos, publisher=message.publisher
+        )
+
+    def _work(self, due_s: dict[str, float]) -> None:
+        """Run the periodic work that is due.
+
+        Raises:
+            BagError: the disk is full, or failed.
+        """
+        now = time.monotonic()
+        if now >= due_s["space"]:
+            due_s["space"] = now + SPACE_S
+            self._look_for_space()
+        if self._state != RECORDING:
+            return
+        if now >= due_s["flush"]:
+            due_s["flush"] = now + FLUSH_S
+            self._writer.flush()
+        if now >= due_s["custom"]:
+            due_s["custom"] = now + _KEEP_CUSTOM_S
+            self._set_custom()
+            self._writer.keep_custom()
+        if now >= due_s["sync"]:
+            due_s["sync"] = now + SYNC_S
+            self._writer.sync()
+
+    def _look_for_space(self) -> None:
+        """End the file when the disk has less space than the reserve; go on once it has more again.
+
+        Raises:
+            BagError: the folder was removed, or the file cannot be completed.
+        """
+        if self._state == FAILED:
+            return
+        try:
+            free = self._free_bytes(self.path)
+        except OSError as error:
+            raise BagError(f"bag {self.path}: {error.strerror}: its folder was removed") from None
+        if self._state == RECORDING and free < self._reserve:
+            self._set_custom()
+            self._writer.end_file()
+            self._fail(DISK_FULL, f"{low_text(self.path, free, self._reserve)}: the bag is complete up to here")
+        elif self._state == DISK_FULL and free >= self._reserve + _ROOM_AGAIN:
+            gone = counts_text(self.not_written) or "nothing"
+            log.warning("%s: space is available again; not recorded so far: %s", self.path, gone)
+            self._state, self._error = RECORDING, ""
+
+    def _fail(self, state: str, text: str) -> None:
+        self._state, self._error, self.failed = state, text, True
+
+    def _set_custom(self) -> None:
+        losses = {"overflow": dict(self.overflow), "disk_full": dict(self.not_written)}
+        for key, value in {**self._custom(), **losses}.items():
+            self._writer.set_custom(f"instant_ic.{key}", json.dumps(value, sort_keys=True))
+
+    def _complete(self) -> None:
+        for step in (self._writer.end_file, self._writer.close):  # the second writes what the first has lost
+            self._set_custom()
+            try:
+                step()
+            except BagError as error:
+                if self._state != FAILED:  # otherwise keep the first reason
+                    self._fail(FAILED, str(error))
+        if self._state != FAILED:
+            self._state = ENDED
+        if self._report and self.error:
+            log.error("%s: %s", self.path, self.error)
+        elif self._report:
+            log.info("%s: %d messages", self.path, self._writer.count)
+
+
+def low_text(path: Path, free: int, reserve: int) -> str:
+    """Return that a disk has less free space than the reserve."""
+    return f"only {free / 1e6:.0f} MB are free for {path}, {reserve / 1e6:.0f} MB are the reserve: not recording"
+
+
+def counts_text(counts: Mapping[str, int]) -> str:
+    """Return counts by topic as text."""
+    return ", ".join(f"{topic} {number}" for topic, number in sorted(counts.items()))
