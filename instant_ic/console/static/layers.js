@@ -4,20 +4,12 @@
 
 /** @import { Colour } from "./colour.js" */
 /** @import { Mat3, Vec3 } from "./math.js" */
-import { identity, multiply, rotate, transpose } from "./math.js";
+/** @import { Mesh } from "./messages.js" */
+import { multiply, rotate, transpose } from "./math.js";
 import { plain } from "./colour.js";
-import { Program } from "./program.js";
+import { createTexture, Program, setImage } from "./program.js";
 
-/**
- * Triangles with an image. The vertices are corners of the panorama's pixels; `size` is height and width of that lattice.
- * @typedef {object} Surface
- * @property {ImageBitmap} image colours, equirectangular
- * @property {ImageBitmap | null} confidence grey image: white is seen, black is estimated; null: all of it was seen
- * @property {[number, number]} size
- * @property {Uint16Array} corners column and row of each vertex
- * @property {Float32Array} inverse inverse depth of each vertex, 1/m
- * @property {Uint32Array} triangles
- */
+/** @typedef {Omit<Mesh, "image" | "confidence"> & {image: ImageBitmap, confidence: ImageBitmap | null}} Surface A mesh with decoded images. */
 /**
  * A surface round a keyframe.
  * @typedef {object} Layer
@@ -42,7 +34,7 @@ import { Program } from "./program.js";
 /** @typedef {{vertices: WebGLVertexArrayObject, count: number, image: WebGLTexture, confidence: WebGLTexture, surface: Surface, buffers: WebGLBuffer[]}} Loaded */
 
 const NEAR_M = 0.02;
-const IMAGE = 6, CONFIDENCE = 7; // texture units
+const WHITE = [255, 255, 255];
 const BEYOND_LEVEL = 4; // mipmap level of what no layer covers
 
 // Homogeneous coordinates are divided by the vertex's distance, so that infinitely far vertices need no large numbers.
@@ -132,7 +124,7 @@ export class LayerRenderer {
     this._anisotropy = slow ? null : gl.getExtension("EXT_texture_filter_anisotropic");
     /** @type {(Loaded & {layer: Layer})[]} Each is shown where the ones before show nothing. */
     this._layers = [];
-    this._empty = this._texture(null);
+    this._seen = createTexture(gl, WHITE); // confidence of a surface all of which was seen
   }
 
   /** Replaces the layers; loaded surfaces stay. @param {Layer[]} layers */
@@ -156,12 +148,8 @@ export class LayerRenderer {
    * @param {boolean} mixed blending is on: each pixel is written once, the nearest surface found before
    */
   render(camera, width, height, tint, photo = null, mixed = false) {
-    const gl = this._gl, at = this._program.use();
+    const gl = this._gl;
     gl.viewport(0, 0, width, height);
-    gl.uniform2fv(at("tanHalf"), camera.tanHalf);
-    gl.uniform3fv(at("offset"), tint.offset);
-    gl.uniform1i(at("image"), IMAGE);
-    gl.uniform1i(at("confidence"), CONFIDENCE);
     gl.enable(gl.DEPTH_TEST);
     gl.enable(gl.STENCIL_TEST);
     gl.depthFunc(gl.LESS);
@@ -169,25 +157,30 @@ export class LayerRenderer {
     gl.clear(gl.STENCIL_BUFFER_BIT);
     // Stencil bit k: layer k shows a surface here. A surface seen from behind hides, but shows the layers below.
     this._layers.forEach(({ vertices, count, image, confidence, surface, layer }, k) => {
-      const panoramaFromMap = transpose(layer.mapFromCamera), [x, y, z] = camera.position, [px, py, pz] = layer.position;
-      // Transposed: row-major read by columns.
-      gl.uniformMatrix3fv(at("lookFromPanorama"), false, multiply(panoramaFromMap, camera.mapFromLook));
-      gl.uniform3fv(at("position"), rotate(panoramaFromMap, [x - px, y - py, z - pz]));
+      const panoramaFromMap = transpose(layer.mapFromCamera), source = photo ?? layer;
+      /** @param {Vec3} place in the map frame @returns {Vec3} in the keyframe's frame */
+      const local = ([x, y, z]) => {
+        const [px, py, pz] = layer.position;
+        return rotate(panoramaFromMap, [x - px, y - py, z - pz]);
+      };
+      this._program.use({
+        size: surface.size,
+        tanHalf: camera.tanHalf,
+        lookFromPanorama: multiply(transpose(camera.mapFromLook), layer.mapFromCamera),
+        position: local(camera.position),
+        imageFromPanorama: multiply(transpose(source.mapFromCamera), layer.mapFromCamera),
+        imagePosition: local(source.position),
+        image: photo?.image ?? image,
+        confidence,
+        soft: !photo && surface.confidence !== null,
+        gain: photo ? tint.gain : times(layer.gain, tint.gain),
+        offset: tint.offset,
+      });
       gl.clear(gl.DEPTH_BUFFER_BIT);
       gl.stencilMask(1 << k);
       gl.stencilFunc(gl.EQUAL, 1 << k, (1 << k) - 1);
       gl.stencilOpSeparate(gl.FRONT, gl.KEEP, gl.KEEP, gl.REPLACE);
       gl.stencilOpSeparate(gl.BACK, gl.KEEP, gl.KEEP, gl.ZERO);
-      gl.activeTexture(gl.TEXTURE0 + CONFIDENCE);
-      gl.bindTexture(gl.TEXTURE_2D, confidence);
-      gl.activeTexture(gl.TEXTURE0 + IMAGE);
-      gl.bindTexture(gl.TEXTURE_2D, photo?.image ?? image);
-      gl.uniform2fv(at("size"), surface.size);
-      gl.uniform3fv(at("gain"), photo ? tint.gain : times(layer.gain, tint.gain));
-      const { mapFromCamera, position: [cx, cy, cz] } = photo ?? layer;
-      gl.uniformMatrix3fv(at("imageFromPanorama"), true, photo ? multiply(transpose(mapFromCamera), layer.mapFromCamera) : identity);
-      gl.uniform3fv(at("imagePosition"), rotate(panoramaFromMap, [cx - px, cy - py, cz - pz]));
-      gl.uniform1i(at("soft"), Number(!photo && surface.confidence !== null));
       gl.bindVertexArray(vertices);
       if (mixed) {
         gl.colorMask(false, false, false, false);
@@ -216,36 +209,26 @@ export class LayerRenderer {
    * @param {number} level mipmap level @param {number} dim 1: dim and grey
    */
   renderFar(image, panoramaFromLook, tanHalf, tint = plain, level = 0, dim = 0) {
-    const gl = this._gl, at = this._far.use();
-    gl.activeTexture(gl.TEXTURE0 + IMAGE);
-    gl.bindTexture(gl.TEXTURE_2D, image);
-    gl.uniform1i(at("image"), IMAGE);
-    gl.uniformMatrix3fv(at("panoramaFromLook"), true, panoramaFromLook); // our matrices are row-major
-    gl.uniform2fv(at("tanHalf"), tanHalf);
-    gl.uniform3fv(at("gain"), tint.gain);
-    gl.uniform3fv(at("offset"), tint.offset);
-    gl.uniform1f(at("level"), level);
-    gl.uniform1f(at("dim"), dim);
-    gl.drawArrays(gl.TRIANGLES, 0, 3);
+    this._far.fill({ image, panoramaFromLook, tanHalf, ...tint, level, dim });
   }
 
   /** @param {Surface} surface @returns {Loaded} */
   _upload(surface) {
     const gl = this._gl, vertices = gl.createVertexArray(), buffers = [0, 1, 2].map(() => gl.createBuffer());
+    const attributes = /** @type {const} */ ([
+      ["corner", surface.corners, 2, gl.UNSIGNED_SHORT], ["inverse", surface.inverse, 1, gl.FLOAT]]);
     gl.bindVertexArray(vertices);
-    gl.bindBuffer(gl.ARRAY_BUFFER, buffers[0]);
-    gl.bufferData(gl.ARRAY_BUFFER, surface.corners, gl.STATIC_DRAW);
-    const [corner, inverse] = ["corner", "inverse"].map((name) => gl.getAttribLocation(this._program.linked, name));
-    gl.enableVertexAttribArray(corner);
-    gl.vertexAttribPointer(corner, 2, gl.UNSIGNED_SHORT, false, 0, 0);
-    gl.bindBuffer(gl.ARRAY_BUFFER, buffers[1]);
-    gl.bufferData(gl.ARRAY_BUFFER, surface.inverse, gl.STATIC_DRAW);
-    gl.enableVertexAttribArray(inverse);
-    gl.vertexAttribPointer(inverse, 1, gl.FLOAT, false, 0, 0);
+    attributes.forEach(([name, values, size, type], i) => {
+      const place = gl.getAttribLocation(this._program.linked, name);
+      gl.bindBuffer(gl.ARRAY_BUFFER, buffers[i]);
+      gl.bufferData(gl.ARRAY_BUFFER, values, gl.STATIC_DRAW);
+      gl.enableVertexAttribArray(place);
+      gl.vertexAttribPointer(place, size, type, false, 0, 0);
+    });
     gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, buffers[2]);
     gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, surface.triangles, gl.STATIC_DRAW);
     gl.bindVertexArray(null);
-    const confidence = surface.confidence ? this._texture(surface.confidence) : this._empty;
+    const confidence = surface.confidence ? this._texture(surface.confidence) : this._seen;
     return { vertices, count: surface.triangles.length, image: this._texture(surface.image), confidence, surface, buffers };
   }
 
@@ -254,22 +237,16 @@ export class LayerRenderer {
     const gl = this._gl;
     gl.deleteVertexArray(vertices);
     gl.deleteTexture(image);
-    if (confidence !== this._empty) gl.deleteTexture(confidence);
+    if (confidence !== this._seen) gl.deleteTexture(confidence);
     for (const buffer of buffers) gl.deleteBuffer(buffer);
   }
 
-  /** @param {ImageBitmap | null} bitmap */
+  /** @param {ImageBitmap} bitmap */
   _texture(bitmap) {
-    const gl = this._gl, texture = gl.createTexture(), extension = this._anisotropy;
-    gl.activeTexture(gl.TEXTURE0 + IMAGE);
-    gl.bindTexture(gl.TEXTURE_2D, texture);
-    if (bitmap) gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGB8, gl.RGB, gl.UNSIGNED_BYTE, bitmap);
-    else gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGB8, 1, 1, 0, gl.RGB, gl.UNSIGNED_BYTE, new Uint8Array([255, 255, 255]));
+    const gl = this._gl, texture = createTexture(gl, WHITE), extension = this._anisotropy;
+    setImage(gl, texture, bitmap);
     gl.generateMipmap(gl.TEXTURE_2D);
-    gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_WRAP_S, gl.REPEAT);
-    gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_WRAP_T, gl.CLAMP_TO_EDGE);
     gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MIN_FILTER, this._minification);
-    gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MAG_FILTER, gl.LINEAR);
     if (extension) gl.texParameterf(gl.TEXTURE_2D, extension.TEXTURE_MAX_ANISOTROPY_EXT, 8);
     return texture;
   }

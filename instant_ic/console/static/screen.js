@@ -12,7 +12,7 @@
 /** @import { GlViewer } from "./viewer.js" */
 import { byId, elementOf, mark } from "./dom.js";
 import { FrameRate } from "./framerate.js";
-import { drawCompass, drawGuide } from "./guide.js";
+import { showCompass, showGuide } from "./guide.js";
 import { showLatency } from "./hud.js";
 import { shows } from "./images.js";
 import { radians, transpose } from "./math.js";
@@ -24,12 +24,11 @@ const LOOK_MS = 100; // shortest interval between two look messages
 const MAX_FOV = radians(149);
 const LATENCY_MS = 250;
 const SLOW_FRAME_MS = 45; // shortest frame time when the CPU renders, with fewer pixels
-const SLOW_PIXELS = 0.5, SLOW_VIEW_PIXELS = 0.36, SLOW_LAYER_PIXELS = 0.42; // share of the window's pixels per axis
+const SLOW_PIXELS = 0.45; // share of the window's pixels per axis
 const SLOW_MAP_MS = 200;
 const STILL_PIXELS = 0.5, LEAST_PIXELS = 0.3; // smallest shown turn while the robot stands, and while the v-bot is driven
 const REPORT_MS = 500; // longest interval between two reports of the shown state while the camera is shown
 const IDLE_MS = 200; // longest interval between two frames while messages arrive
-const COLOURS = { real: "#45c4b0", entering: "#45c4b0", virtual: "#f0ac45", returning: "#f0ac45", stopped: "#ff6b57", none: "#a3adb8" };
 
 export class Screen {
   /** @param {GlViewer} viewer @param {Images} images @param {Look} look @param {Link} link @param {Lease} lease */
@@ -46,8 +45,6 @@ export class Screen {
     this.plan = { trajectory: [], path: [], subgoal: null };
     /** @type {Settings} */
     this.settings = DEFAULTS;
-    this._guide = elementOf("guide", HTMLCanvasElement);
-    this._compass = elementOf("compass-tape", HTMLCanvasElement);
     this._rate = new FrameRate();
     this._frameAt = this._viewAt = this._steppedAt = performance.now();
     this._requested = this._wanted = false;
@@ -55,8 +52,7 @@ export class Screen {
     this._latencyAt = this._mapAt = this._lookAt = 0;
     /** Rotation and field of view of the last rendered image. @type {number[]} */
     this._direction = [];
-    this._sentLook = this._viewKey = this._guideKey = this._mapKey = "";
-    this._reported = "";
+    this._sentLook = this._viewKey = this._mapKey = this._reported = "";
     this._reportedAt = 0;
     link.addEventListener("open", () => {
       this._sentLook = "";
@@ -133,7 +129,7 @@ export class Screen {
     const moved = this._renderView(scene);
     this._reportShown();
     this._rate.frame(now, moved);
-    this._drawOverlay(scene, tanHalf);
+    this._showOverlay(scene, tanHalf);
     this._drawMap(tanHalf, now);
     if (now - this._latencyAt > LATENCY_MS) {
       this._latencyAt = now;
@@ -189,7 +185,7 @@ export class Screen {
    */
   _renderView(scene) {
     const { viewer, images, look } = this;
-    const resized = fit(viewer.canvas, viewer.slow ? slowPixels(scene) : 1);
+    const resized = fit(viewer.canvas, viewer.slow ? SLOW_PIXELS : 1);
     const key = rounded([scene.blend], 4) + rounded(scene.blend > 0 ? scene.camera?.position : scene.glide?.to, 3);
     const direction = [...scene.mapFromLook, look.vfov];
     // A standing robot's pose is never still: SLAM turns it by parts of a milliradian with every scan. The v-bot's is.
@@ -211,17 +207,10 @@ export class Screen {
   }
 
   /** @param {Scene} scene @param {[number, number]} tanHalf */
-  _drawOverlay(scene, tanHalf) {
-    const { look } = this, position = this._cameraPosition(), colour = COLOURS[this.state?.mode ?? "none"];
-    const trajectory = position && this.link.connected ? this.plan.trajectory : [];
-    // Without a trajectory nothing in the overlay can move.
-    const place = trajectory.length && position ? rounded([...scene.mapFromLook, ...position], 3) + trajectory.join() : "";
-    const key = [place, colour, rounded([look.yaw, look.vfov, ...tanHalf], 3)].join();
-    if (!fit(this._compass) && key === this._guideKey) return;
-    this._guideKey = key;
-    const camera = { lookFromMap: transpose(scene.mapFromLook), position: position ?? [0, 0, 0] };
-    drawGuide(this._guide, trajectory, camera, tanHalf, this.settings.footprint[1] / 2, colour);
-    drawCompass(this._compass, look.yaw, colour);
+  _showOverlay(scene, tanHalf) {
+    const position = this._cameraPosition(), camera = { lookFromMap: transpose(scene.mapFromLook), position: position ?? [0, 0, 0] };
+    showGuide(position && this.link.connected ? this.plan.trajectory : [], camera, tanHalf, this.settings.footprint[1] / 2);
+    showCompass(this.look.yaw);
   }
 
   /** @param {[number, number]} tanHalf @param {number} now */
@@ -253,13 +242,6 @@ export class Screen {
     const [x, y, yaw] = motion.pose;
     return [x + Math.cos(yaw) * cx - Math.sin(yaw) * cy, y + Math.sin(yaw) * cx + Math.cos(yaw) * cy, cz];
   }
-}
-
-/** Share of the window's pixels per axis when the CPU renders: few for a scene that costs much, or has few itself. @param {Scene} scene */
-function slowPixels({ blend, camera, glide }) {
-  if (glide) return SLOW_LAYER_PIXELS;
-  if (blend < 1) return SLOW_PIXELS;
-  return camera ? SLOW_LAYER_PIXELS : SLOW_VIEW_PIXELS;
 }
 
 /** @param {readonly number[] | null | undefined} values @param {number} digits */

@@ -7,9 +7,9 @@
 import { plain } from "./colour.js";
 import { LayerRenderer } from "./layers.js";
 import { identity } from "./math.js";
-import { Program } from "./program.js";
+import { createTexture, Program, setImage } from "./program.js";
 
-const VIEW = 1; // texture unit of the rendered view
+const DARK = [9, 11, 14]; // before the first image
 
 // A rendered view of the server, which fades out towards its edge.
 const FRAGMENT = `
@@ -27,12 +27,12 @@ void main() {
   colour = vec4(rgb * gain + offset, d.x > 0.0 ? edge.x * edge.y : 0.0);
 }`;
 
-/** Size of the samples, cells; each is the mean of SAMPLE_FINE × SAMPLE_FINE pixels. */
-export const SAMPLE = /** @type {const} */ ([40, 24]), SAMPLE_FINE = 4;
+/** Width and height of the samples, pixels. */
+const SAMPLE = /** @type {const} */ ([64, 40]);
 // Pause between two frames that the CPU renders, as a share of the time that it takes for one, and the longest.
 const REST = 0.3, MOST_REST_MS = 100;
 
-/** @typedef {{1: number[], 2: number[], weights: number[]}} Samples Colours by kind of image. */
+/** @typedef {{1: number[], 2: number[], weights: number[]}} Samples Colours by kind of image: 3 values per pixel, 0..1. */
 
 export class GlViewer {
   /**
@@ -53,9 +53,9 @@ export class GlViewer {
     canvas.addEventListener("webglcontextlost", () => { this.lost = true; });
     this._renderer = new LayerRenderer(gl, this.slow);
     this._overlay = new Program(gl, FRAGMENT);
-    this._panorama = this._texture(gl.REPEAT);
-    this._view = this._texture(gl.CLAMP_TO_EDGE);
-    this._samples = this._target(SAMPLE[0] * SAMPLE_FINE, SAMPLE[1] * SAMPLE_FINE);
+    this._panorama = createTexture(gl, DARK);
+    this._view = createTexture(gl, DARK);
+    this._samples = this._target(...SAMPLE);
     /** @type {WebGLSync | null} Signalled when the CPU has rendered the last frame. */
     this._fence = null;
     this._renderedAt = 0;
@@ -69,12 +69,12 @@ export class GlViewer {
 
   /** @param {ImageBitmap} bitmap */
   setPanorama(bitmap) {
-    this._upload(this._panorama, bitmap);
+    setImage(this.gl, this._panorama, bitmap);
   }
 
   /** @param {ImageBitmap} bitmap */
   setView(bitmap) {
-    this._upload(this._view, bitmap);
+    setImage(this.gl, this._view, bitmap);
   }
 
   /** Replaces the layers that are rendered for a scene with their camera. @param {Layer[]} layers */
@@ -119,16 +119,16 @@ export class GlViewer {
   }
 
   /**
-   * Returns panorama and view without colour matching, small and in the same projection: {1: panorama, 2: view} with
-   * 3 values per cell, 0..1, and `weights`, which are 0 where the view shows no seen place.
+   * Returns panorama and view without colour matching, small and in the same projection; `weights` are 0 where the view
+   * shows no seen place.
    * @param {Scene} scene @returns {Samples}
    */
   sample(scene) {
-    const gl = this.gl, width = SAMPLE[0] * SAMPLE_FINE, height = SAMPLE[1] * SAMPLE_FINE;
-    const pixels = new Uint8Array(4 * width * height);
+    const gl = this.gl, [width, height] = SAMPLE, pixels = new Uint8Array(4 * width * height);
     const read = () => {
       gl.readPixels(0, 0, width, height, gl.RGBA, gl.UNSIGNED_BYTE, pixels);
-      return cells(pixels);
+      const values = Array.from(pixels, (value) => value / 255);
+      return { colours: values.filter((_, i) => i % 4 < 3), alpha: values.filter((_, i) => i % 4 === 3) };
     };
     gl.bindFramebuffer(gl.FRAMEBUFFER, this._samples);
     this._renderReal(scene, width, height, plain);
@@ -165,16 +165,7 @@ export class GlViewer {
 
   /** @param {Pick<Scene, "viewFromLook" | "tanHalf" | "viewTanHalf">} scene @param {Colour} colour */
   _renderView({ viewFromLook, tanHalf, viewTanHalf }, colour) {
-    const gl = this.gl, at = this._overlay.use();
-    gl.activeTexture(gl.TEXTURE0 + VIEW);
-    gl.bindTexture(gl.TEXTURE_2D, this._view);
-    gl.uniform1i(at("view"), VIEW);
-    gl.uniformMatrix3fv(at("viewFromLook"), true, viewFromLook); // our matrices are row-major
-    gl.uniform2fv(at("tanHalf"), tanHalf);
-    gl.uniform2fv(at("viewTanHalf"), viewTanHalf);
-    gl.uniform3fv(at("gain"), colour.gain);
-    gl.uniform3fv(at("offset"), colour.offset);
-    gl.drawArrays(gl.TRIANGLES, 0, 3);
+    this._overlay.fill({ view: this._view, viewFromLook, tanHalf, viewTanHalf, ...colour });
   }
 
   /** @param {number} width @param {number} height */
@@ -190,41 +181,4 @@ export class GlViewer {
     gl.bindFramebuffer(gl.FRAMEBUFFER, null);
     return buffer;
   }
-
-  /** @param {number} wrap */
-  _texture(wrap) {
-    const gl = this.gl, texture = gl.createTexture();
-    gl.activeTexture(gl.TEXTURE0 + VIEW);
-    gl.bindTexture(gl.TEXTURE_2D, texture);
-    gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGB8, 1, 1, 0, gl.RGB, gl.UNSIGNED_BYTE, new Uint8Array([9, 11, 14]));
-    gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MIN_FILTER, gl.LINEAR);
-    gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MAG_FILTER, gl.LINEAR);
-    gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_WRAP_S, wrap);
-    gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_WRAP_T, gl.CLAMP_TO_EDGE);
-    return texture;
-  }
-
-  /** @param {WebGLTexture} texture @param {ImageBitmap} bitmap */
-  _upload(texture, bitmap) {
-    const gl = this.gl;
-    gl.activeTexture(gl.TEXTURE0 + VIEW);
-    gl.bindTexture(gl.TEXTURE_2D, texture);
-    gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGB8, gl.RGB, gl.UNSIGNED_BYTE, bitmap);
-  }
-}
-
-/**
- * Averages RGBA pixels over the cells: 3 colours and 1 alpha per cell, 0..1.
- * @param {Uint8Array} pixels
- * @returns {{colours: number[], alpha: number[]}}
- */
-export function cells(pixels) {
-  const [columns, rows] = SAMPLE, fine = SAMPLE_FINE, share = 1 / (255 * fine * fine);
-  const colours = new Array(3 * columns * rows).fill(0), alpha = new Array(columns * rows).fill(0);
-  for (let i = 0; i < pixels.length / 4; i++) {
-    const cell = Math.floor(i / (columns * fine) / fine) * columns + Math.floor((i % (columns * fine)) / fine);
-    for (let channel = 0; channel < 3; channel++) colours[3 * cell + channel] += pixels[4 * i + channel] * share;
-    alpha[cell] += pixels[4 * i + 3] * share;
-  }
-  return { colours, alpha };
 }

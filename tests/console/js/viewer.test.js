@@ -1,12 +1,11 @@
-// Geometry of the view: directions, sample cells, motion and the trajectory's extension.
+// Geometry of the view: directions, motion and the trajectory's extension.
 
 import assert from "node:assert/strict";
 import { test } from "node:test";
 import "./page.js";
 
 const math = await import("../../../instant_ic/console/static/math.js");
-const { cells, SAMPLE, SAMPLE_FINE } = await import("../../../instant_ic/console/static/viewer.js");
-const { extended, tiles } = await import("../../../instant_ic/console/static/guide.js");
+const { extended } = await import("../../../instant_ic/console/static/guide.js");
 const { Motion } = await import("../../../instant_ic/console/static/motion.js");
 const { ServerClock } = await import("../../../instant_ic/console/static/clock.js");
 
@@ -28,17 +27,6 @@ test("a quaternion about z is the rotation about z", () => {
 
 test("angles wrap into a half turn to either side", () => {
   close([3 * Math.PI / 2, -3 * Math.PI / 2, 0.1 + 4 * Math.PI].map(math.wrapAngle), [-Math.PI / 2, Math.PI / 2, 0.1]);
-});
-
-test("a sample cell is the mean of its pixels", () => {
-  const [columns, rows] = SAMPLE, width = columns * SAMPLE_FINE, height = rows * SAMPLE_FINE;
-  const pixels = new Uint8Array(4 * width * height);
-  // The second cell of the second row: one of its 16 pixels is red, all are opaque.
-  for (let y = 4; y < 8; y++) for (let x = 4; x < 8; x++) pixels[4 * (y * width + x) + 3] = 255;
-  pixels[4 * (5 * width + 6)] = 255;
-  const { colours, alpha } = cells(pixels), cell = columns + 1;
-  close(colours.slice(3 * cell, 3 * cell + 3), [1 / 16, 0, 0]);
-  close([alpha[cell], alpha[cell + 1], alpha[0]], [1, 0, 0]);
 });
 
 test("a straight trajectory is extended straight to four metres, a bent one along its arc", () => {
@@ -81,10 +69,4 @@ test("the server's clock follows the fastest answer, and the quality the slow on
   assert.equal(clock.quality, "poor");
   clock.reset();
   assert.equal(clock.at(0), null);
-});
-
-test("the trajectory's canvas covers whole tiles around it, within the window", () => {
-  assert.deepEqual(tiles([[300, 500], [420, 470]], 1280, 720), { x: 256, y: 448, width: 192, height: 64 });
-  assert.deepEqual(tiles([[-50, 700], [63, 900]], 1280, 720), { x: 0, y: 640, width: 128, height: 80 });
-  assert.equal(tiles([[-90, 500], [-40, 600]], 1280, 720).width, 0);
 });
