@@ -2,7 +2,7 @@
 // The operator's page: connects link, lease, drive, images and overlay.
 
 /** @import { Frame, GridFrame, Message } from "./messages.js" */
-import { byId, elementOf, mark } from "./dom.js";
+import { all, byId, elementOf, mark } from "./dom.js";
 import { attachStick, Drive, isDriveKey } from "./drive.js";
 import { Gamepads } from "./gamepad.js";
 import * as hud from "./hud.js";
@@ -13,7 +13,6 @@ import { Look } from "./look.js";
 import { LAYERS, MAP, PANORAMA, VIEW } from "./messages.js";
 import { Recording } from "./record.js";
 import { Screen } from "./screen.js";
-import { settingsOf } from "./settings.js";
 import { GlViewer } from "./viewer.js";
 
 const canvas = elementOf("view", HTMLCanvasElement), scale = elementOf("scale", HTMLInputElement);
@@ -27,7 +26,6 @@ const look = new Look(canvas);
 const images = new Images(viewer, link);
 const screen = new Screen(viewer, images, look, link, lease);
 const recording = new Recording(link);
-const pads = new Gamepads(drive, look);
 const wake = () => screen.wake();
 
 /** Returns the viewer. Without WebGL 2 it throws, and the page can only stop the robot. */
@@ -71,15 +69,14 @@ lease.addEventListener("change", () => {
 });
 onDetail(link, "message", (/** @type {Message} */ message) => {
   switch (message.type) {
-    case "hello": {
-      const settings = screen.settings = settingsOf(message, matchMedia("(prefers-reduced-motion: reduce)").matches);
-      lease.mayDrive = recording.mayRecord = settings.mayDrive;
-      mark("mayDrive", String(settings.mayDrive));
-      images.configure(settings);
+    case "hello":
+      lease.mayDrive = recording.mayRecord = message.may_drive;
+      mark("mayDrive", String(message.may_drive));
+      drive.limits = { linear: message.max_linear, angular: message.max_angular };
+      screen.settings = message.page;
+      images.configure(message.page, matchMedia("(prefers-reduced-motion: reduce)").matches);
       images.expectLayers();
-      drive.limits = settings.limits;
       break;
-    }
     case "state":
       screen.take(message);
       hud.showMode(message, lease.driver);
@@ -181,9 +178,12 @@ function glide() {
   hud.toast(`Smooth motion of the camera's image: ${images.glides ? "on" : "off"}`);
 }
 
-const slower = () => setScale(+scale.value - 10), faster = () => setScale(+scale.value + 10);
-/** @type {Record<string, () => void>} */
+/** @param {number} percent */
+const changeScale = (percent) => setScale(+scale.value + percent);
+const slower = () => changeScale(-10), faster = () => changeScale(10);
+/** @type {Record<string, () => void>} By key; buttons name one in data-key. */
 const SHORTCUTS = {
+  KeyC: () => look.centre(),
   KeyM: () => screen.enlargeMap(),
   KeyR: () => recording.toggle(),
   KeyB: () => recording.mark(),
@@ -200,32 +200,17 @@ window.addEventListener("keydown", (event) => {
   SHORTCUTS[event.code]?.();
   if (isDriveKey(event)) askForTheLease();
 }, { capture: true });
-/** @type {Record<string, () => void>} */
-const CLICKS = {
-  take: () => lease.takeOver(),
-  yield: () => lease.handOver(),
-  compass: () => look.centre(),
-  "map-size": SHORTCUTS.KeyM,
-  "map-canvas": SHORTCUTS.KeyM,
-  fullscreen: fullScreen,
-  "fullscreen-more": fullScreen,
-  "help-open": help,
-  "help-more": help,
-  "save-view": SHORTCUTS.KeyP,
-};
-for (const [id, action] of Object.entries(CLICKS)) byId(id).addEventListener("click", action);
-for (const button of document.querySelectorAll("#more button")) {
+for (const element of all("[data-key]")) element.addEventListener("click", SHORTCUTS[element.dataset.key ?? ""]);
+byId("take").addEventListener("click", () => lease.takeOver());
+byId("yield").addEventListener("click", () => lease.handOver());
+for (const button of all("#more button")) {
   button.addEventListener("click", () => byId("more").hidePopover());
 }
 scale.addEventListener("input", () => setScale(+scale.value));
 scale.addEventListener("change", () => scale.blur());
 hud.holdToConfirm(byId("release"), () => link.send({ type: "estop_release" }));
 attachStick(byId("stick"), drive);
-pads.addEventListener("drive", askForTheLease);
-pads.addEventListener("stop", stopNow);
-pads.addEventListener("centre", () => look.centre());
-onDetail(pads, "scale", (/** @type {number} */ change) => setScale(+scale.value + change));
-onDetail(pads, "notice", hud.toast);
+new Gamepads(drive, look, { drive: askForTheLease, stop: stopNow, changeScale, notice: hud.toast, wake });
 drive.addEventListener("change", () => {
   images.prediction.command(drive.command, link.serverNow());
   showCommand();
@@ -235,7 +220,7 @@ onDetail(drive, "stop", (/** @type {string} */ why) => {
   if (why) hud.toast(`Stopped: ${why}`);
 });
 
-const keyCaps = [...document.querySelectorAll("#keys kbd")].filter((cap) => cap instanceof HTMLElement);
+const keyCaps = all("#keys kbd");
 
 function showCommand() {
   hud.showCommand(drive);
@@ -245,9 +230,7 @@ function showCommand() {
 for (const name of ["pointerdown", "pointermove", "wheel", "dblclick", "click", "keydown", "keyup", "resize"]) {
   window.addEventListener(name, wake, { passive: true });
 }
-for (const [target, name] of /** @type {const} */ ([[link, "open"], [link, "lost"], [pads, "look"], [pads, "centre"]])) {
-  target.addEventListener(name, wake);
-}
+for (const name of ["open", "lost"]) link.addEventListener(name, wake);
 
 mark("quality", viewer.slow ? "plain" : "full");
 setScale(70);

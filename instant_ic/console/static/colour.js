@@ -91,7 +91,7 @@ export class Releasing {
   constructor() {
     this._colour = plain;
     this._since = 0;
-    this.releaseMs = 6000;
+    this.releaseMs = 0;
   }
 
   /** @param {Colour} colour @param {number} now ms */

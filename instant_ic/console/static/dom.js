@@ -15,6 +15,9 @@ export function elementOf(id, type) {
   return element;
 }
 
+/** HTML elements of a CSS selector. @param {string} selector @returns {HTMLElement[]} */
+export const all = (selector) => [...document.querySelectorAll(selector)].filter((element) => element instanceof HTMLElement);
+
 /** 2D context of a canvas. @param {HTMLCanvasElement} canvas @param {CanvasRenderingContext2DSettings} [options] */
 export function context2d(canvas, options) {
   const context = canvas.getContext("2d", options);

@@ -13,15 +13,21 @@ const LOOK_RATE = radians(110); // per second, at full deflection
 const STEP = 10; // percent of the speed limit
 
 /**
- * Events: "drive" (the shoulder button was pressed), "look" (the direction changed), "stop", "centre", "scale" (detail: percent to add),
- * "notice" (detail: text). It drives only if the window has focus and the button was pressed after it gained focus.
+ * @typedef {object} PadActions
+ * @property {() => void} drive the shoulder button was pressed
+ * @property {() => void} stop
+ * @property {(percent: number) => void} changeScale adds to the speed limit
+ * @property {(text: string) => void} notice
+ * @property {() => void} wake the direction changed
  */
-export class Gamepads extends EventTarget {
-  /** @param {Drive} drive @param {Look} look */
-  constructor(drive, look) {
-    super();
+
+/** It drives only if the window has focus and the button was pressed after it gained focus. */
+export class Gamepads {
+  /** @param {Drive} drive @param {Look} look @param {PadActions} actions */
+  constructor(drive, look, actions) {
     this.drive = drive;
     this.look = look;
+    this.actions = actions;
     /** @type {number | null} Index of the active pad. */
     this._index = null;
     /** @type {Set<number>} */
@@ -39,7 +45,7 @@ export class Gamepads extends EventTarget {
   /** @param {Gamepad} pad */
   _connect(pad) {
     if (pad.mapping !== "standard") {
-      this._emit("notice", `Gamepad ${pad.id} cannot drive: the browser does not know its layout.`);
+      this.actions.notice(`Gamepad ${pad.id} cannot drive: the browser does not know its layout.`);
       return;
     }
     if (this._index !== null) return;
@@ -48,7 +54,7 @@ export class Gamepads extends EventTarget {
     this._timer = setInterval(() => this._poll(), POLL_MS);
     this._held = pressed(pad); // a button held already was not pressed for driving
     mark("pad", "ready");
-    this._emit("notice", "Gamepad connected: hold a shoulder button and drive with the left stick.");
+    this.actions.notice("Gamepad connected: hold a shoulder button and drive with the left stick.");
   }
 
   _lose() {
@@ -67,20 +73,18 @@ export class Gamepads extends EventTarget {
     const held = pressed(pad), fresh = [...held].filter((button) => !this._held.has(button));
     this._held = held;
     const focused = document.hasFocus() && !document.hidden;
-    if (fresh.includes(STOP)) this._emit("stop"); // also without focus
+    if (fresh.includes(STOP)) this.actions.stop(); // also without focus
     if (!focused) return this._release();
     if (!this.drive.enabled) this._release(); // not the driver, or an emergency stop
-    if (fresh.includes(CENTRE)) this._emit("centre");
-    if (fresh.includes(FASTER)) this._emit("scale", STEP);
-    if (fresh.includes(SLOWER)) this._emit("scale", -STEP);
+    if (fresh.includes(FASTER)) this.actions.changeScale(STEP);
+    if (fresh.includes(SLOWER)) this.actions.changeScale(-STEP);
     const [yaw, pitch] = [deadZone(-pad.axes[2]), deadZone(-pad.axes[3])];
-    if (yaw || pitch) {
-      this.look.turn(yaw * LOOK_RATE * seconds, pitch * LOOK_RATE * seconds);
-      this._emit("look");
-    }
+    if (yaw || pitch) this.look.turn(yaw * LOOK_RATE * seconds, pitch * LOOK_RATE * seconds);
+    if (fresh.includes(CENTRE)) this.look.centre();
+    if (yaw || pitch || fresh.includes(CENTRE)) this.actions.wake();
     if (fresh.some((button) => SHOULDERS.includes(button))) {
       this._driving = true;
-      this._emit("drive");
+      this.actions.drive();
     }
     if (!SHOULDERS.some((button) => held.has(button))) this._release();
     if (this._driving) this.drive.setStick(deadZone(-pad.axes[1]), deadZone(-pad.axes[0]));
@@ -92,11 +96,6 @@ export class Gamepads extends EventTarget {
     this._driving = false;
     this.drive.setStick(0, 0);
     mark("pad", "ready");
-  }
-
-  /** @param {string} kind @param {string | number} [detail] */
-  _emit(kind, detail) {
-    this.dispatchEvent(new CustomEvent(kind, { detail }));
   }
 }
 

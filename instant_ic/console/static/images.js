@@ -6,12 +6,11 @@
 /** @import { Look } from "./look.js" */
 /** @import { Mat3, Vec3 } from "./math.js" */
 /** @import { Camera, Layer, Photo, Surface } from "./layers.js" */
-/** @import { LayerData, LayersFrame, LayersHeader, Mesh, PanoramaFrame, PanoramaHeader, State, ViewFrame, ViewHeader } from "./messages.js" */
-/** @import { Settings } from "./settings.js" */
+/** @import { LayerData, LayersFrame, LayersHeader, Mesh, PageSettings, PanoramaFrame, PanoramaHeader, State, ViewFrame, ViewHeader } from "./messages.js" */
 /** @import { GlViewer } from "./viewer.js" */
 import { coloured, fitColour, plain, Releasing } from "./colour.js";
 import { clamp, fromQuaternion, identity, lookRotation, multiply, rotate, rotationZ, transpose } from "./math.js";
-import { PANORAMA, VIEW } from "./messages.js";
+import { DEFAULT_PAGE, PANORAMA, VIEW } from "./messages.js";
 import { Motion } from "./motion.js";
 import { Prediction } from "./prediction.js";
 
@@ -51,7 +50,7 @@ export class Images {
     /** @type {View | null} */
     this.view = null;
     this.blend = 0;
-    this.dissolveMs = 250;
+    this.dissolveMs = 0;
     this.changed = true;
     this.motion = new Motion();
     this.prediction = new Prediction();
@@ -88,19 +87,15 @@ export class Images {
     this._colouredAt = 0;
     /** @type {Record<Kind, number[]>} */
     this._arrivals = { [PANORAMA]: [], [VIEW]: [] };
+    this.configure(DEFAULT_PAGE);
   }
 
-  /** @param {Settings} settings */
-  configure(settings) {
-    this.dissolveMs = settings.dissolveMs;
-    this.motion.easeMs = settings.easeMs;
-    this.prediction.maxAccel = settings.maxAccel;
-    this.colourReleaseMs = settings.colourReleaseMs;
-  }
-
-  /** Time in which a colour matched at a switch fades out; 0: colours are not matched. @param {number} value */
-  set colourReleaseMs(value) {
-    for (const colour of Object.values(this._colours)) colour.releaseMs = value;
+  /** @param {PageSettings} settings @param {boolean} still the operator's system asks for little motion */
+  configure({ dissolve_ms, ease_ms, max_accel, colour_release_s }, still = false) {
+    this.dissolveMs = still ? 0 : dissolve_ms;
+    this.motion.easeMs = still ? 0 : ease_ms;
+    this.prediction.maxAccel = max_accel;
+    for (const colour of Object.values(this._colours)) colour.releaseMs = 1000 * colour_release_s; // 0: no matching
   }
 
   /** Decodes an image, passes it to the viewer, then acknowledges it. @param {PanoramaFrame | ViewFrame} frame */

@@ -41,9 +41,7 @@ export class Look {
     }, { passive: false });
     element.addEventListener("dblclick", () => this.centre());
     window.addEventListener("keydown", (event) => {
-      if (event.ctrlKey || event.metaKey || event.altKey) return;
-      if (event.code in KEYS) this._held.add(event.code);
-      if (event.code === "KeyC") this.centre();
+      if (event.code in KEYS && !event.ctrlKey && !event.metaKey && !event.altKey) this._held.add(event.code);
     });
     window.addEventListener("keyup", (event) => this._held.delete(event.code));
     window.addEventListener("blur", () => this._held.clear());

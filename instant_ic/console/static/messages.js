@@ -25,8 +25,11 @@ const flag = (value, name) => (typeof value === "boolean" ? value : refuse(name,
 const oneOf = (...values) => (value, name) =>
   values.find((known) => known === value) ?? refuse(name, `one of ${values.join(", ")}`, value);
 
-/** A field that may be missing or null. @template T @param {Reader<T>} read @returns {Reader<T | null>} */
-const optional = (read) => (value, name) => (value === null || value === undefined ? null : read(value, name));
+/** A field that may be missing or null. @template T @param {Reader<T>} read @param {NoInfer<T>} instead @returns {Reader<T>} */
+const defaulted = (read, instead) => (value, name) => (value === null || value === undefined ? instead : read(value, name));
+
+/** @template T @param {Reader<T>} read @returns {Reader<T | null>} */
+const optional = (read) => defaulted(/** @type {Reader<T | null>} */ (read), null);
 
 /** @template T @param {Reader<T>} read @returns {Reader<T[]>} */
 const list = (read) => (value, name) =>
@@ -59,13 +62,14 @@ const object = (fields) => (value, name) => {
 };
 
 const page = object({
-  dissolve_ms: optional(number),
-  ease_ms: optional(number),
-  colour_release_s: optional(number),
-  max_accel: optional(pair),
-  footprint: optional(pair),
-  camera: optional(triple),
+  dissolve_ms: defaulted(number, 250),
+  ease_ms: defaulted(number, 400),
+  colour_release_s: defaulted(number, 6),
+  max_accel: defaulted(pair, [0.8, 2]), // m/s², rad/s²
+  footprint: defaulted(pair, [0.6, 0.5]), // length, width, m
+  camera: defaulted(triple, [0, 0, 1.2]), // position on the robot, m
 });
+export const DEFAULT_PAGE = page({}, "page");
 const hello = object({
   type: oneOf("hello"), max_linear: number, max_angular: number, may_drive: flag, page,
 });
@@ -124,6 +128,7 @@ const refused = object({
 });
 const error = object({ type: oneOf("error"), text });
 
+/** @typedef {typeof DEFAULT_PAGE} PageSettings */
 /** @typedef {ReturnType<typeof hello>} Hello */
 /** @typedef {ReturnType<typeof pong>} Pong */
 /** @typedef {ReturnType<typeof session>} Session */

@@ -3,7 +3,7 @@
 
 /** @import { GridHeader, Plan } from "./messages.js" */
 /** @import { Vec3 } from "./math.js" */
-import { context2d } from "./dom.js";
+import { byId, context2d } from "./dom.js";
 
 /** @typedef {{image: HTMLCanvasElement, header: GridHeader}} Layer */
 /**
@@ -19,6 +19,7 @@ import { context2d } from "./dom.js";
 
 const COLOURS = { real: "#45c4b0", virtual: "#f0ac45", path: "#8fb8ff", goal: "#ffffff" };
 const RADIUS_M = 3.5; // half the width shown in the small map
+const CONE_M = 1.7; // length of the shown cone of sight
 
 export class MiniMap {
   /** @param {HTMLCanvasElement} canvas */
@@ -27,43 +28,35 @@ export class MiniMap {
     this.context = context2d(canvas);
     this.large = false;
     this.changed = true; // render although no pose has changed
-    /** @type {{floor: Layer | null, costs: Layer | null, walls: Layer | null}} */
-    this._layers = { floor: null, costs: null, walls: null };
+    /** @type {{costmap: Layer | null, map: Layer | null}} In the order of rendering. */
+    this._layers = { costmap: null, map: null };
   }
 
   /** Sets a layer of grey cells (gridimage.py). @param {"map" | "costmap"} name @param {ImageBitmap} bitmap @param {GridHeader} header */
   setLayer(name, bitmap, header) {
     this.changed = true;
-    if (name === "costmap") {
-      this._layers.costs = { image: coloured(bitmap, costColour), header };
-      return;
-    }
-    this._layers.floor = { image: coloured(bitmap, floorColour), header };
-    this._layers.walls = { image: coloured(bitmap, wallColour), header };
+    this._layers[name] = { image: coloured(bitmap, name === "map" ? mapColour : costColour), header };
   }
 
   get hasMap() {
-    return this._layers.walls !== null;
+    return this._layers.map !== null;
   }
 
   /** @param {MapScene} scene */
-  draw(scene) {
+  draw({ virtual, robot, vbot, plan, footprint, lookYaw, hfov }) {
     this.changed = false;
-    const { context, canvas } = this;
-    const { width, height } = canvas;
-    context.setTransform(1, 0, 0, 1, 0, 0);
-    context.clearRect(0, 0, width, height);
-    const shown = scene.virtual ? scene.vbot ?? scene.robot : scene.robot ?? scene.vbot;
-    if (!shown) return this._say("No pose yet");
-    const scale = this._place(shown, width, height);
+    const { context, canvas } = this, shown = virtual ? vbot ?? robot : robot ?? vbot;
+    context.reset();
+    byId("map-empty").hidden = shown !== null;
+    if (!shown) return;
+    const scale = this._place(shown, canvas.width, canvas.height), pixel = 1 / scale;
     for (const layer of Object.values(this._layers)) if (layer) this._drawLayer(layer);
-    const pixel = 1 / scale;
-    this._cone(shown, scene, 1.7);
-    this._line(scene.plan.path, COLOURS.path, 2 * pixel, [6 * pixel, 5 * pixel]);
-    this._line(scene.plan.trajectory, scene.virtual ? COLOURS.virtual : COLOURS.real, 3 * pixel, []);
-    if (scene.plan.subgoal) this._goal(scene.plan.subgoal, pixel);
-    if (scene.robot) this._robot(scene.robot, scene.footprint, COLOURS.real, pixel, true);
-    if (scene.vbot && scene.virtual) this._robot(scene.vbot, scene.footprint, COLOURS.virtual, pixel, false);
+    this._cone(shown, shown[2] + lookYaw, hfov / 2);
+    this._line(plan.path, COLOURS.path, 2 * pixel, [6 * pixel, 5 * pixel]);
+    this._line(plan.trajectory, virtual ? COLOURS.virtual : COLOURS.real, 3 * pixel, []);
+    if (plan.subgoal) this._goal(plan.subgoal, pixel);
+    if (robot) this._robot(robot, footprint, COLOURS.real, pixel, true);
+    if (vbot && virtual) this._robot(vbot, footprint, COLOURS.virtual, pixel, false);
   }
 
   /**
@@ -72,8 +65,8 @@ export class MiniMap {
    */
   _place([x, y, yaw], width, height) {
     const context = this.context;
-    if (this.large && this._layers.walls) {
-      const { header } = this._layers.walls;
+    if (this.large && this._layers.map) {
+      const { header } = this._layers.map;
       const w = header.width * header.resolution, h = header.height * header.resolution;
       const scale = Math.min(width / (w + 1), height / (h + 1));
       context.translate(width / 2, height / 2);
@@ -101,19 +94,16 @@ export class MiniMap {
     context.restore();
   }
 
-  /** @param {[number, number][]} points @param {string} colour @param {number} width @param {number[]} dash */
+  /** @param {[number, number][]} points @param {string} colour @param {number} width m @param {number[]} dash */
   _line(points, colour, width, dash) {
-    if (points.length < 2) return;
     const context = this.context;
-    context.save();
     context.strokeStyle = colour;
     context.lineWidth = width;
     context.lineJoin = context.lineCap = "round";
     context.setLineDash(dash);
     context.beginPath();
-    points.forEach(([x, y], i) => (i ? context.lineTo(x, y) : context.moveTo(x, y)));
+    for (const [x, y] of points) context.lineTo(x, y);
     context.stroke();
-    context.restore();
   }
 
   /** @param {Vec3} goal @param {number} pixel m */
@@ -121,24 +111,22 @@ export class MiniMap {
     const context = this.context;
     context.strokeStyle = COLOURS.goal;
     context.lineWidth = 2 * pixel;
-    context.beginPath();
-    context.arc(x, y, 6 * pixel, 0, 2 * Math.PI);
-    context.moveTo(x + 1.5 * pixel, y);
-    context.arc(x, y, 1.5 * pixel, 0, 2 * Math.PI);
-    context.stroke();
+    for (const radius of [6, 1.5]) {
+      context.beginPath();
+      context.arc(x, y, radius * pixel, 0, 2 * Math.PI);
+      context.stroke();
+    }
   }
 
-  /** @param {Vec3} pose @param {MapScene} scene @param {number} length m */
-  _cone([x, y, yaw], scene, length) {
-    const context = this.context;
-    const middle = yaw + scene.lookYaw;
-    const gradient = context.createRadialGradient(x, y, 0, x, y, length);
+  /** The shown part of the surroundings. @param {Vec3} pose @param {number} middle direction @param {number} half angle */
+  _cone([x, y], middle, half) {
+    const context = this.context, gradient = context.createRadialGradient(x, y, 0, x, y, CONE_M);
     gradient.addColorStop(0, "rgba(255,255,255,0.28)");
     gradient.addColorStop(1, "rgba(255,255,255,0)");
     context.fillStyle = gradient;
     context.beginPath();
     context.moveTo(x, y);
-    context.arc(x, y, length, middle - scene.hfov / 2, middle + scene.hfov / 2);
+    context.arc(x, y, CONE_M, middle - half, middle + half);
     context.fill();
   }
 
@@ -166,15 +154,6 @@ export class MiniMap {
     context.fill();
     context.restore();
   }
-
-  /** @param {string} text */
-  _say(text) {
-    const { context, canvas } = this;
-    context.fillStyle = "#a3adb8";
-    context.font = `${13 * devicePixelRatio}px system-ui, sans-serif`;
-    context.textAlign = "center";
-    context.fillText(text, canvas.width / 2, canvas.height / 2);
-  }
 }
 
 /** @param {ImageBitmap} bitmap @param {(cell: number) => number[]} colour of a cell */
@@ -191,9 +170,7 @@ function coloured(bitmap, colour) {
 }
 
 // Colours [r, g, b, alpha] of a cell: 0..100, 255 unknown.
-/** @param {number} cell */
-const floorColour = (cell) => (cell < 50 ? [150, 165, 180, 70 - cell] : [0, 0, 0, 0]);
-/** @param {number} cell */
-const wallColour = (cell) => (cell >= 50 && cell <= 100 ? [226, 232, 238, 120 + 1.3 * cell] : [0, 0, 0, 0]);
+/** Floor and walls. @param {number} cell */
+const mapColour = (cell) => (cell < 50 ? [150, 165, 180, 70 - cell] : cell <= 100 ? [226, 232, 238, 120 + 1.3 * cell] : [0, 0, 0, 0]);
 /** @param {number} cell */
 const costColour = (cell) => (cell <= 100 ? [255, 110, 80, 0.6 * cell] : [0, 0, 0, 0]);

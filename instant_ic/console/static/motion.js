@@ -13,7 +13,7 @@ export class Motion {
   constructor() {
     /** @type {Vec3 | null} x, y, yaw in the map frame; null: unknown. */
     this.pose = null;
-    this.easeMs = 400;
+    this.easeMs = 0;
     /** @type {Vec3 | null} Pose of the shown robot without the remaining offset of the other one. */
     this.own = null;
     /** @type {Vec3} Remaining offset of the other robot's pose. */

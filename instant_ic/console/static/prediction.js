@@ -14,7 +14,7 @@ const SETTLED_MS = 700; // from this age of a command on, the speed of the state
 export class Prediction {
   constructor() {
     /** @type {[number, number]} Largest change of the speed, m/s² and rad/s². */
-    this.maxAccel = [0.8, 2];
+    this.maxAccel = [0, 0];
     /** @type {{at: number, twist: Twist}[]} Commands and the times from which on they were sent, oldest first. */
     this._commands = [];
   }

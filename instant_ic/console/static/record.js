@@ -23,9 +23,7 @@ export class Recording {
     this._status = NO_ANSWER;
     /** @type {number | null} Number of the last notice. */
     this._notice = null;
-    byId("record").addEventListener("click", () => this.toggle());
     byId("snapshot").addEventListener("click", () => this._send({ type: "snapshot" }));
-    byId("mark").addEventListener("click", () => this.mark());
   }
 
   get running() {

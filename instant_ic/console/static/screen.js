@@ -2,8 +2,7 @@
 // Renders main image, trajectory, compass and map, each only if it has changed. Frames follow each other while something
 // moves; otherwise a message, an image or an input requests the next one.
 
-/** @import { Settings } from "./settings.js" */
-/** @import { Plan, State } from "./messages.js" */
+/** @import { PageSettings, Plan, State } from "./messages.js" */
 /** @import { Images, Scene } from "./images.js" */
 /** @import { Lease } from "./lease.js" */
 /** @import { Link } from "./link.js" */
@@ -16,9 +15,9 @@ import { showCompass, showGuide } from "./guide.js";
 import { showLatency } from "./hud.js";
 import { shows } from "./images.js";
 import { radians, transpose } from "./math.js";
+import { DEFAULT_PAGE } from "./messages.js";
 import { MiniMap } from "./minimap.js";
 import { saveView } from "./save.js";
-import { DEFAULTS } from "./settings.js";
 
 const LOOK_MS = 100; // shortest interval between two look messages
 const MAX_FOV = radians(149);
@@ -43,8 +42,8 @@ export class Screen {
     this.state = null;
     /** @type {Pick<Plan, "trajectory" | "path" | "subgoal">} The newest plan message. */
     this.plan = { trajectory: [], path: [], subgoal: null };
-    /** @type {Settings} */
-    this.settings = DEFAULTS;
+    /** @type {PageSettings} */
+    this.settings = DEFAULT_PAGE;
     this._rate = new FrameRate();
     this._frameAt = this._viewAt = this._steppedAt = performance.now();
     this._requested = this._wanted = false;

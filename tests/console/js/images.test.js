@@ -6,6 +6,7 @@ import "./page.js";
 
 const { Images } = await import("../../../instant_ic/console/static/images.js");
 const { identity, rotationZ } = await import("../../../instant_ic/console/static/math.js");
+const { DEFAULT_PAGE } = await import("../../../instant_ic/console/static/messages.js");
 const { fitColour, plain, Releasing } = await import("../../../instant_ic/console/static/colour.js");
 
 function close(found, expected, tolerance) {
@@ -17,7 +18,7 @@ function scenes(slow, duration, at) {
   let now = 0;
   const images = new Images({ slow, sample() {} }, { serverNow: () => now, roundTripMs: 10, acknowledge() {} });
   images.layers = { version: 1, mount: [0.1, 0, 1.2] };
-  images.colourReleaseMs = 0;
+  images.configure({ ...DEFAULT_PAGE, colour_release_s: 0 });
   const found = [];
   for (; now < duration; now += 10) {
     const { panorama, state } = at(now);
@@ -75,6 +76,12 @@ test("an old panorama is aimed anew when the robot turns", () => {
   });
   close(found[0].panoramaFromLook, identity, 1e-9);
   close(found.at(-1).panoramaFromLook, rotationZ(0.5), 1e-3);
+});
+
+test("a switch is a cut where the operator's system asks for little motion", () => {
+  const images = new Images({ slow: true }, {});
+  images.configure(DEFAULT_PAGE, true);
+  assert.deepEqual([images.dissolveMs, images.motion.easeMs], [0, 0]);
 });
 
 test("a colour is fitted in spite of what moved, and not at all without overlap", () => {

@@ -3,8 +3,7 @@
 import assert from "node:assert/strict";
 import { test } from "node:test";
 
-const { decodeFrame, frameNumber, MessageError, parseMessage } = await import("../../../instant_ic/console/static/messages.js");
-const { settingsOf } = await import("../../../instant_ic/console/static/settings.js");
+const { DEFAULT_PAGE, decodeFrame, frameNumber, MessageError, parseMessage } = await import("../../../instant_ic/console/static/messages.js");
 
 const STATE = {
   type: "state", at_ms: 5, mode: "virtual", shown: "virtual", robot: [1, 2, 0.1], vbot: null, twist: [0.2, 0],
@@ -121,14 +120,9 @@ test("layers that cannot be rendered are refused by the name of what is wrong", 
   assert.equal(frameNumber(new ArrayBuffer(5)), null);
 });
 
-test("settings: the server's values, else the defaults; no motion for those who asked for none", () => {
-  const plain = settingsOf(parseMessage(JSON.stringify(HELLO)), false);
-  assert.deepEqual([plain.dissolveMs, plain.easeMs, plain.colourReleaseMs], [250, 400, 6000]);
-  assert.deepEqual(plain.limits, { linear: 0.4, angular: 0.8 });
-  const page = { dissolve_ms: 100, ease_ms: 0, colour_release_s: 0, footprint: [1, 2] };
-  const given = settingsOf(parseMessage(JSON.stringify({ ...HELLO, page })), false);
-  assert.deepEqual([given.dissolveMs, given.easeMs, given.colourReleaseMs], [100, 0, 0]);
-  assert.deepEqual(given.footprint, [1, 2]);
-  const reduced = settingsOf(parseMessage(JSON.stringify({ ...HELLO, page })), true);
-  assert.deepEqual([reduced.dissolveMs, reduced.easeMs], [0, 0]);
+test("settings of the page: the server's values, else the defaults", () => {
+  const settings = (page) => parseMessage(JSON.stringify({ ...HELLO, page })).page;
+  assert.deepEqual(settings({}), DEFAULT_PAGE);
+  assert.deepEqual(settings({ dissolve_ms: 100, ease_ms: 0, footprint: [1, 2], camera: null }),
+    { ...DEFAULT_PAGE, dissolve_ms: 100, ease_ms: 0, footprint: [1, 2] });
 });

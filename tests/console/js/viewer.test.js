@@ -40,6 +40,7 @@ test("a straight trajectory is extended straight to four metres, a bent one alon
 
 test("the shown pose runs on with the velocity and eases the other robot's offset out", () => {
   const motion = new Motion();
+  motion.easeMs = 400;
   motion.follow("real", [0, 0, 0], [0.4, 0], 0, 16);
   motion.follow("real", [0, 0, 0], [0.4, 0], 100, 16); // a state 0.1 s old
   assert.ok(motion.pose[0] > 0 && motion.pose[0] <= 0.04);
