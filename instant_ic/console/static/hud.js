@@ -34,7 +34,6 @@ export function showLatency(link, images) {
   };
   const ms = texts.millisecondsText;
   put("link-ms", link.roundTripMs, (value) => ms(value) + (link.quality ? ` · ${link.quality}` : ""), 80, 200);
-  mark("linkQuality", link.quality ?? "none");
   put("image-ms", images.ageMs(), ms, 400, 1000);
   put("camera-ms", images.blend < 1 ? images.cameraMs : null, ms, 400, 1000);
   const rate = link.commandHz ? ` · ${Math.round(link.commandHz)} /s` : "";

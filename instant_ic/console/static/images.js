@@ -1,15 +1,14 @@
 // @ts-check
 // The newest panorama and rendered view, and the scene composed of them.
 
-/** @import { Colour } from "./colour.js" */
 /** @import { Link } from "./link.js" */
 /** @import { Look } from "./look.js" */
 /** @import { Mat3, Vec3 } from "./math.js" */
 /** @import { Camera, Layer, Photo, Surface } from "./layers.js" */
 /** @import { LayerData, LayersFrame, LayersHeader, Mesh, PageSettings, PanoramaFrame, PanoramaHeader, State, ViewFrame, ViewHeader } from "./messages.js" */
 /** @import { GlViewer } from "./viewer.js" */
-import { coloured, fitColour, plain, Releasing } from "./colour.js";
-import { clamp, fromQuaternion, identity, lookRotation, multiply, rotate, rotationZ, transpose } from "./math.js";
+import { fitGains, plain, Releasing } from "./colour.js";
+import { clamp, fromQuaternion, identity, lookRotation, multiply, rotate, rotationZ, times, transpose } from "./math.js";
 import { DEFAULT_PAGE, PANORAMA, VIEW } from "./messages.js";
 import { Motion } from "./motion.js";
 import { Prediction } from "./prediction.js";
@@ -27,14 +26,13 @@ import { Prediction } from "./prediction.js";
  * @property {Glide | null} glide the camera's image from another place; null: as it was taken
  * @property {Camera | null} camera of the layers, which then take the place of the rendered view; null: there are none
  * @property {number} blend 0 panorama, 1 view
- * @property {Colour} panoramaColour
- * @property {Colour} viewColour
+ * @property {Vec3} panoramaGain of the colours
+ * @property {Vec3} viewGain
  */
 
 const STALE_MS = 2000;
 // Longest wait for an image made after the change of mode; afterwards the best available is shown.
 const WAIT_MS = { [PANORAMA]: 300, [VIEW]: 500 };
-const RELEASE_STEP_MS = 100; // the matched colour fades in steps too small to be seen
 const LAYERS_MS = 5000; // longest wait for the layers of a new link
 const ELSEWHERE_M = 0.5; // a camera image taken farther away is shown as it was taken
 const FROZEN_MS = 1000; // an older one too
@@ -83,8 +81,7 @@ export class Images {
     this._nearRobot = true;
     this._changedAt = 0;
     this._toward = 0;
-    this._colours = { [PANORAMA]: new Releasing(), [VIEW]: new Releasing() };
-    this._colouredAt = 0;
+    this._gains = { [PANORAMA]: new Releasing(), [VIEW]: new Releasing() };
     /** @type {Record<Kind, number[]>} */
     this._arrivals = { [PANORAMA]: [], [VIEW]: [] };
     this.configure(DEFAULT_PAGE);
@@ -95,7 +92,7 @@ export class Images {
     this.dissolveMs = still ? 0 : dissolve_ms;
     this.motion.easeMs = still ? 0 : ease_ms;
     this.prediction.maxAccel = max_accel;
-    for (const colour of Object.values(this._colours)) colour.releaseMs = 1000 * colour_release_s; // 0: no matching
+    for (const gains of Object.values(this._gains)) gains.releaseMs = 1000 * colour_release_s; // 0: no matching
   }
 
   /** Decodes an image, passes it to the viewer, then acknowledges it. @param {PanoramaFrame | ViewFrame} frame */
@@ -231,13 +228,13 @@ export class Images {
       glide,
       camera: this.layers && this.rendersLayers ? this._camera(this.layers, mapFromLook, tanHalf, glide) : null,
       blend: this.blend * this.blend * (3 - 2 * this.blend),
-      panoramaColour: plain,
-      viewColour: plain,
+      panoramaGain: plain,
+      viewGain: plain,
     };
     if (starts && this.panorama && (this.view || scene.camera)) this._match(scene, now);
-    this._release(now);
-    scene.panoramaColour = this._colours[PANORAMA].at(now);
-    scene.viewColour = this._colours[VIEW].at(now);
+    scene.panoramaGain = this._gains[PANORAMA].at(now);
+    scene.viewGain = this._gains[VIEW].at(now);
+    if (Object.values(this._gains).some((gains) => gains.active)) this.changed = true;
     return scene;
   }
 
@@ -316,20 +313,11 @@ export class Images {
 
   /** Matches the colours of the new image to the old one; both show the same place. @param {Scene} scene @param {number} now */
   _match(scene, now) {
-    if (this._colours[VIEW].releaseMs <= 0) return;
+    if (this._gains[VIEW].releaseMs <= 0) return;
     const seen = this.viewer.sample(scene);
     /** @type {[Kind, Kind]} */
     const [comes, goes] = this._toward ? [VIEW, PANORAMA] : [PANORAMA, VIEW];
-    const shown = coloured(seen[goes], this._colours[goes].at(now));
-    this._colours[comes].set(fitColour(seen[comes], shown, seen.weights), now);
-  }
-
-  /** @param {number} now */
-  _release(now) {
-    const active = Object.values(this._colours).some((colour) => colour.active);
-    if (!active || now - this._colouredAt < RELEASE_STEP_MS) return;
-    this._colouredAt = now;
-    this.changed = true;
+    this._gains[comes].set(times(fitGains(seen[comes], seen[goes], seen.weights), this._gains[goes].at(now)), now);
   }
 
   /** Updates the pose of the shown robot between the state messages. @param {State | null} state @param {number} elapsedMs */

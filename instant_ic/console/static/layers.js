@@ -2,10 +2,9 @@
 // Renderer in WebGL 2: layers of triangles around a keyframe, from any place (Python: vspace/layers.py), with their own
 // colours or with the camera's image; and the camera's image as it was taken, without depth.
 
-/** @import { Colour } from "./colour.js" */
 /** @import { Mat3, Vec3 } from "./math.js" */
 /** @import { Mesh } from "./messages.js" */
-import { multiply, rotate, transpose } from "./math.js";
+import { multiply, rotate, times, transpose } from "./math.js";
 import { plain } from "./colour.js";
 import { createTexture, Program, setImage } from "./program.js";
 
@@ -75,7 +74,7 @@ const FRAGMENT = `
 in vec3 direction;
 out vec4 colour;
 uniform sampler2D image, confidence;
-uniform vec3 gain, offset;
+uniform vec3 gain;
 uniform bool soft; // estimated surfaces are blurred and paler
 
 void main() {
@@ -94,7 +93,7 @@ void main() {
       colour.rgb = mix(mix(estimate, vec3(dot(estimate, GREY)), 0.5), colour.rgb, seen);
     }
   }
-  colour.rgb = colour.rgb * gain + offset;
+  colour.rgb *= gain;
 }`;
 
 // Panorama by direction alone: an image as it was taken, or the blurred colours where no layer has a surface.
@@ -104,11 +103,11 @@ out vec4 colour;
 uniform sampler2D image;
 uniform mat3 panoramaFromLook;
 uniform vec2 tanHalf;
-uniform vec3 gain, offset;
+uniform vec3 gain;
 uniform float level, dim; // mipmap level; share of grey
 void main() {
   vec2 angle = angles(panoramaFromLook * normalize(vec3(1.0, -screen.x * tanHalf.x, screen.y * tanHalf.y)));
-  vec3 rgb = gain * textureLod(image, vec2(0.5 - angle.x / (2.0 * PI), angle.y / PI), level).rgb + offset;
+  vec3 rgb = gain * textureLod(image, vec2(0.5 - angle.x / (2.0 * PI), angle.y / PI), level).rgb;
   colour = vec4(mix(rgb, vec3(0.023, 0.028, 0.036) + 0.35 * dot(rgb, GREY), dim), 0.0);
 }`;
 
@@ -143,7 +142,7 @@ export class LayerRenderer {
   /**
    * The alpha of what is rendered is 1 where the place was seen.
    * @param {Camera} camera @param {number} width @param {number} height
-   * @param {Colour} tint gain and offset of the colours
+   * @param {Vec3} tint gains of the colours
    * @param {Photo | null} photo takes the place of the layers' own colours; only the depth of estimated surfaces counts then
    * @param {boolean} mixed blending is on: each pixel is written once, the nearest surface found before
    */
@@ -173,8 +172,7 @@ export class LayerRenderer {
         image: photo?.image ?? image,
         confidence,
         soft: !photo && surface.confidence !== null,
-        gain: photo ? tint.gain : times(layer.gain, tint.gain),
-        offset: tint.offset,
+        gain: photo ? tint : times(layer.gain, tint),
       });
       gl.clear(gl.DEPTH_BUFFER_BIT);
       gl.stencilMask(1 << k);
@@ -198,18 +196,18 @@ export class LayerRenderer {
     gl.stencilFunc(gl.EQUAL, 0, 0xff);
     gl.stencilOp(gl.KEEP, gl.KEEP, gl.KEEP);
     const last = this._layers[this._layers.length - 1], { image, mapFromCamera } = photo ?? { ...last, ...last.layer };
-    const beyond = photo ? tint : { ...tint, gain: times(last.layer.gain, tint.gain) };
+    const beyond = photo ? tint : times(last.layer.gain, tint);
     this.renderFar(image, multiply(transpose(mapFromCamera), camera.mapFromLook), camera.tanHalf, beyond, photo ? 0 : BEYOND_LEVEL);
     gl.disable(gl.STENCIL_TEST);
   }
 
   /**
    * Renders a panorama by direction alone; its alpha is 0.
-   * @param {WebGLTexture} image @param {Mat3} panoramaFromLook @param {[number, number]} tanHalf @param {Colour} tint
+   * @param {WebGLTexture} image @param {Mat3} panoramaFromLook @param {[number, number]} tanHalf @param {Vec3} gain of the colours
    * @param {number} level mipmap level @param {number} dim 1: dim and grey
    */
-  renderFar(image, panoramaFromLook, tanHalf, tint = plain, level = 0, dim = 0) {
-    this._far.fill({ image, panoramaFromLook, tanHalf, ...tint, level, dim });
+  renderFar(image, panoramaFromLook, tanHalf, gain = plain, level = 0, dim = 0) {
+    this._far.fill({ image, panoramaFromLook, tanHalf, gain, level, dim });
   }
 
   /** @param {Surface} surface @returns {Loaded} */
@@ -251,6 +249,3 @@ export class LayerRenderer {
     return texture;
   }
 }
-
-/** @param {number[]} a @param {number[]} b */
-const times = (a, b) => a.map((value, i) => value * b[i]);

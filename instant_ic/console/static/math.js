@@ -41,6 +41,9 @@ export function rotate(m, v) {
   ];
 }
 
+/** @param {Vec3} a @param {Vec3} b @returns {Vec3} */
+export const times = (a, b) => [a[0] * b[0], a[1] * b[1], a[2] * b[2]];
+
 /** Rotation matrix of a quaternion. @param {[number, number, number, number]} q x, y, z, w @returns {Mat3} */
 export function fromQuaternion([x, y, z, w]) {
   return [

@@ -1,9 +1,9 @@
 // @ts-check
 // The view in WebGL 2: the camera's image and the virtual space, by one renderer.
 
-/** @import { Colour } from "./colour.js" */
 /** @import { Scene } from "./images.js" */
 /** @import { Layer } from "./layers.js" */
+/** @import { Vec3 } from "./math.js" */
 import { plain } from "./colour.js";
 import { LayerRenderer } from "./layers.js";
 import { identity } from "./math.js";
@@ -19,12 +19,12 @@ out vec4 colour;
 uniform sampler2D view;
 uniform mat3 viewFromLook;
 uniform vec2 tanHalf, viewTanHalf; // of the shown field of view and of the rendered one
-uniform vec3 gain, offset;
+uniform vec3 gain;
 void main() {
   vec3 d = viewFromLook * vec3(1.0, -screen.x * tanHalf.x, screen.y * tanHalf.y);
   vec2 at = vec2(-d.y, d.z) / (d.x * viewTanHalf), edge = smoothstep(1.0, 0.94, abs(at));
   vec3 rgb = textureLod(view, vec2(0.5 + 0.5 * at.x, 0.5 - 0.5 * at.y), 0.0).rgb;
-  colour = vec4(rgb * gain + offset, d.x > 0.0 ? edge.x * edge.y : 0.0);
+  colour = vec4(rgb * gain, d.x > 0.0 ? edge.x * edge.y : 0.0);
 }`;
 
 /** Width and height of the samples, pixels. */
@@ -90,13 +90,13 @@ export class GlViewer {
   /** @param {Scene} scene */
   render(scene) {
     const gl = this.gl, { width, height } = this.canvas;
-    if (scene.blend > 0) this._renderVirtual(scene, width, height, scene.viewColour);
+    if (scene.blend > 0) this._renderVirtual(scene, width, height, scene.viewGain);
     if (scene.blend < 1) {
       // Over the virtual space.
       if (scene.blend > 0) gl.enable(gl.BLEND);
       gl.blendColor(0, 0, 0, 1 - scene.blend);
       gl.blendFunc(gl.CONSTANT_ALPHA, gl.ONE_MINUS_CONSTANT_ALPHA);
-      this._renderReal(scene, width, height, scene.panoramaColour);
+      this._renderReal(scene, width, height, scene.panoramaGain);
       gl.disable(gl.BLEND);
     }
     if (!this.slow) return;
@@ -139,33 +139,33 @@ export class GlViewer {
     return { 1: panorama.colours, 2: view.colours, weights: view.alpha };
   }
 
-  /** @param {Scene} scene @param {number} width @param {number} height @param {Colour} colour */
-  _renderReal(scene, width, height, colour) {
+  /** @param {Scene} scene @param {number} width @param {number} height @param {Vec3} gain */
+  _renderReal(scene, width, height, gain) {
     const { glide, mapFromLook, tanHalf } = scene, image = this._panorama;
     this.gl.viewport(0, 0, width, height);
-    if (!glide || !this._renderer.ready) this._renderer.renderFar(image, scene.panoramaFromLook, tanHalf, colour);
+    if (!glide || !this._renderer.ready) this._renderer.renderFar(image, scene.panoramaFromLook, tanHalf, gain);
     else {
       const camera = { mapFromLook, position: glide.to, tanHalf };
-      this._renderer.render(camera, width, height, colour, { image, ...glide.from }, this.gl.isEnabled(this.gl.BLEND));
+      this._renderer.render(camera, width, height, gain, { image, ...glide.from }, this.gl.isEnabled(this.gl.BLEND));
     }
   }
 
-  /** @param {Scene} scene @param {number} width @param {number} height @param {Colour} colour */
-  _renderVirtual(scene, width, height, colour) {
-    if (scene.camera && this._renderer.ready) return this._renderer.render(scene.camera, width, height, colour);
+  /** @param {Scene} scene @param {number} width @param {number} height @param {Vec3} gain */
+  _renderVirtual(scene, width, height, gain) {
+    if (scene.camera && this._renderer.ready) return this._renderer.render(scene.camera, width, height, gain);
     const gl = this.gl;
     gl.viewport(0, 0, width, height);
     // Beyond the rendered view's edge the camera's image continues, dim and grey.
     this._renderer.renderFar(this._panorama, scene.panoramaFromLook, scene.tanHalf, plain, 0, 1);
     gl.enable(gl.BLEND);
     gl.blendFuncSeparate(gl.SRC_ALPHA, gl.ONE_MINUS_SRC_ALPHA, gl.ONE, gl.ZERO);
-    this._renderView(scene, colour);
+    this._renderView(scene, gain);
     gl.disable(gl.BLEND);
   }
 
-  /** @param {Pick<Scene, "viewFromLook" | "tanHalf" | "viewTanHalf">} scene @param {Colour} colour */
-  _renderView({ viewFromLook, tanHalf, viewTanHalf }, colour) {
-    this._overlay.fill({ view: this._view, viewFromLook, tanHalf, viewTanHalf, ...colour });
+  /** @param {Pick<Scene, "viewFromLook" | "tanHalf" | "viewTanHalf">} scene @param {Vec3} gain */
+  _renderView({ viewFromLook, tanHalf, viewTanHalf }, gain) {
+    this._overlay.fill({ view: this._view, viewFromLook, tanHalf, viewTanHalf, gain });
   }
 
   /** @param {number} width @param {number} height */
