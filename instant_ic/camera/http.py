@@ -18,7 +18,6 @@ from instant_ic.camera.source import CameraError
 
 MOST_REPLY_BYTES = 256 << 10
 """Largest reply other than the preview; the camera's longest has a few thousand bytes."""
-_CHUNK = 16 << 10
 
 
 class _DeadlineSocket(socket.socket):
@@ -26,48 +25,20 @@ class _DeadlineSocket(socket.socket):
 
     session: DeviceSession
 
-    def recv_into(self, buffer: Any, nbytes: int = 0, flags: int = 0) -> int:
-        """Receive into a buffer; raise TimeoutError at the deadline."""
+    def recv_into(self, *arguments: Any) -> int:
         left_s = self.session.deadline_s - time.monotonic()
         if left_s <= 0.0:
             raise TimeoutError("the reply took too long")
         self.settimeout(left_s)
-        return super().recv_into(buffer, nbytes, flags)
-
-
-class _Adapter(HTTPAdapter):
-    """Adapter that reads every reply except the preview, within the limits, before authentication sees it."""
-
-    def __init__(self, session: DeviceSession) -> None:
-        super().__init__()
-
-        class DeadlineConnection(urllib3.connection.HTTPConnection):
-            def _new_conn(self) -> socket.socket:
-                bound = _DeadlineSocket(fileno=super()._new_conn().detach())
-                bound.session = session
-                return bound
-
-        class DeadlinePool(urllib3.HTTPConnectionPool):
-            ConnectionCls = DeadlineConnection
-
-        self.poolmanager.pool_classes_by_scheme = {"http": DeadlinePool}
-
-    def send(self, request: requests.PreparedRequest, *arguments: Any, **keywords: Any) -> requests.Response:
-        """Send a request; raise CameraError if the reply is encoded or too long."""
-        response = super().send(request, *arguments, **keywords)
-        try:
-            if encoding := response.headers.get("Content-Encoding"):
-                raise CameraError(f"{request.url}: the reply is encoded ({encoding[:40]}), which a Theta never does")
-            if response.status_code != 200 or not is_multipart(response):
-                response.raw = _whole(response)
-        except BaseException:
-            response.close()
-            raise
-        return response
+        return super().recv_into(*arguments)
 
 
 class DeviceSession(requests.Session):
-    """DeviceSession with one device over plain HTTP.
+    """Session with one device over plain HTTP.
+
+    Args:
+        user: for digest authentication; empty: none.
+        password: for digest authentication.
 
     Attributes:
         deadline_s: monotonic time at which reading a reply ends, however slowly its bytes arrive.
@@ -78,8 +49,7 @@ class DeviceSession(requests.Session):
         self.deadline_s = math.inf
         # Proxies and .netrc from the environment do not apply to a camera on the local network.
         self.trust_env = False
-        if user:
-            self.auth = HTTPDigestAuth(user, password)
+        self.auth = HTTPDigestAuth(user, password) if user else None
         self.headers["Accept-Encoding"] = "identity"
         self.headers["Content-Type"] = "application/json;charset=utf-8"
         self.adapters.clear()
@@ -110,24 +80,44 @@ class DeviceSession(requests.Session):
             raise CameraError(f"{url}: the camera's digest challenge cannot be answered ({error!r})") from error
 
 
+class _Adapter(HTTPAdapter):
+    """Adapter that reads every reply except the preview, within the limits, before authentication sees it."""
+
+    def __init__(self, session: DeviceSession) -> None:
+        super().__init__()
+
+        class DeadlineConnection(urllib3.connection.HTTPConnection):
+            def _new_conn(self) -> socket.socket:
+                bound = _DeadlineSocket(fileno=super()._new_conn().detach())
+                bound.session = session
+                return bound
+
+        class DeadlinePool(urllib3.HTTPConnectionPool):
+            ConnectionCls = DeadlineConnection
+
+        self.poolmanager.pool_classes_by_scheme = {"http": DeadlinePool}
+
+    def send(self, request: requests.PreparedRequest, *arguments: Any, **keywords: Any) -> requests.Response:
+        """Send a request; raise CameraError if the reply is encoded or too long."""
+        response = super().send(request, *arguments, **keywords)
+        if response.status_code == 200 and is_multipart(response):
+            return response
+        try:
+            body = response.raw.read(MOST_REPLY_BYTES + 1)
+        except (urllib3.exceptions.HTTPError, OSError) as error:
+            response.close()
+            raise requests.ConnectionError(error, request=request) from error
+        encoding = response.headers.get("Content-Encoding")
+        if encoding or len(body) > MOST_REPLY_BYTES:
+            response.close()
+            limit = f"longer than {MOST_REPLY_BYTES >> 10} kB, the limit for a Theta"
+            what = f"encoded ({encoding[:40]}), which a Theta never does" if encoding else limit
+            raise CameraError(f"{request.url}: the reply is {what}")
+        response.raw.release_conn()
+        response.raw = io.BytesIO(body)
+        return response
+
+
 def is_multipart(response: requests.Response) -> bool:
     """Return whether a reply is the preview."""
     return response.headers.get("Content-Type", "").lower().startswith("multipart/")
-
-
-def _whole(response: requests.Response) -> urllib3.HTTPResponse:
-    """Return a reply with its whole body; raise CameraError if it is longer than ``MOST_REPLY_BYTES``."""
-    raw, body = response.raw, bytearray()
-    try:
-        while len(body) <= MOST_REPLY_BYTES and (data := raw.read1(_CHUNK)):
-            body += data
-    except (urllib3.exceptions.HTTPError, OSError) as error:
-        raise requests.ConnectionError(error, request=response.request) from error
-    if len(body) > MOST_REPLY_BYTES:
-        raise CameraError(
-            f"{response.url}: the reply is longer than {MOST_REPLY_BYTES >> 10} kB, the limit for a Theta"
-        )
-    raw.release_conn()
-    return urllib3.HTTPResponse(
-        io.BytesIO(body), headers=raw.headers, status=raw.status, preload_content=False, decode_content=False
-    )

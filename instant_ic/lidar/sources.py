@@ -14,6 +14,9 @@ _LATE_BURST = 3.0
 class SourceGuard:
     """Sender and packet order of one sensor.
 
+    Args:
+        sensor: address of the sensor; empty accepts the first sender, and no other until the process ends.
+
     Attributes:
         foreign: number of datagrams that were rejected because another sender sent them.
     """
@@ -22,20 +25,14 @@ class SourceGuard:
     """Time without a fault after which the points are trusted again."""
 
     def __init__(self, sensor: str = "") -> None:
-        """Start without a sender.
-
-        Args:
-            sensor: address of the sensor; empty accepts the first sender, and no other until the process ends.
-        """
         self.foreign = 0
         self._configured = bool(sensor)
         self._address = sensor
         self._ports: dict[bool, tuple[int, int]] = {}
         """Source port of data (True) and position packets, and the time of the last packet from it."""
-        self._rival = ""
-        self._rival_ns: int | None = None
         self._late_level = 0.0
-        self._late_ns: int | None = None
+        self._fault: tuple[str, int] | None = None
+        """Newest reason to distrust the points, and its steady time."""
 
     def admit(self, sender: tuple[str, int], is_data: bool, well_formed: bool, now_ns: int) -> bool:
         """Return whether a datagram is from the sensor.
@@ -49,47 +46,39 @@ class SourceGuard:
             now_ns: steady time.
         """
         address, port = sender
-        if not well_formed:
-            foreign = bool(self._address) and address != self._address
-            self.foreign += foreign
-            return not foreign  # may be another product: the stream reports which one
-        self._address = self._address or address
-        if address != self._address:
-            return self._reject(sender, now_ns, doubtful=not self._configured)
-        before = self._ports.get(is_data)
-        if before is not None and before[0] != port and now_ns - before[1] < self.QUIET_S * 1e9:
-            return self._reject(sender, now_ns, doubtful=True)
-        self._ports[is_data] = (port, now_ns)
-        return True
+        if well_formed:
+            self._address = self._address or address
+        same = not self._address or address == self._address  # a payload of another product: the stream reports it
+        before = self._ports.get(is_data, (port, now_ns))
+        second_port = same and well_formed and before[0] != port and now_ns - before[1] < self.QUIET_S * 1e9
+        if same and not second_port:
+            if well_formed:
+                self._ports[is_data] = (port, now_ns)
+            return True
+        self.foreign += 1
+        if second_port or (well_formed and not self._configured):
+            rival = f"{address}:{port}"
+            text = (
+                f"Packets arrive from {rival} as well as from {self._address}. No scan until {rival} has sent nothing "
+                f"for {self.QUIET_S:.0f} s. Disconnect it, or set vlp16_driver `sensor` to the sensor's address and "
+                "restart the driver."
+            )
+            self._fault = text, now_ns
+        return False
 
     def count(self, taken: int, out_of_order: int, now_ns: int) -> None:
         """Count packets that the stream accepted, and those that were late or from another clock."""
         self._late_level = max(0.0, self._late_level + out_of_order - _LATE_SHARE * (taken + out_of_order))
         if self._late_level > _LATE_BURST:
             self._late_level = _LATE_BURST
-            self._late_ns = now_ns
-
-    def doubt(self, now_ns: int) -> str | None:
-        """Return why the points cannot be trusted at a steady time, and what to do; None if they can."""
-        if self._recent(self._rival_ns, now_ns):
-            return (
-                f"Packets arrive from {self._rival} as well as from {self._address}. No scan until {self._rival} has "
-                f"sent nothing for {self.QUIET_S:.0f} s. Disconnect it, or set vlp16_driver `sensor` to the sensor's "
-                "address and restart the driver."
-            )
-        if self._recent(self._late_ns, now_ns):
-            return (
+            text = (
                 f"Packets arrive out of order, as if two senders used the address {self._address or 'of the sensor'}. "
                 f"No scan until packets were in order for {self.QUIET_S:.0f} s. Check for a second sensor or a forged "
                 "sender."
             )
-        return None
+            self._fault = text, now_ns
 
-    def _recent(self, then_ns: int | None, now_ns: int) -> bool:
-        return then_ns is not None and now_ns - then_ns < self.QUIET_S * 1e9
-
-    def _reject(self, sender: tuple[str, int], now_ns: int, doubtful: bool) -> bool:
-        self.foreign += 1
-        if doubtful:
-            self._rival, self._rival_ns = f"{sender[0]}:{sender[1]}", now_ns
-        return False
+    def doubt(self, now_ns: int) -> str | None:
+        """Return why the points cannot be trusted at a steady time, and what to do; None if they can."""
+        fault = self._fault
+        return fault[0] if fault is not None and now_ns - fault[1] < self.QUIET_S * 1e9 else None
