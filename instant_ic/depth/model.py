@@ -108,7 +108,6 @@ class DepthModel:
 
         Returns:
             (h, 2h) float32 with the rows of the network's output. Metric depth is cut to the manifest's range.
-            Relative depth and disparity are shifted where they are not positive, since their shift is free.
 
         Raises:
             ValueError: not such an array.
@@ -194,15 +193,9 @@ class DepthModel:
         """Convert the network's depth output to depth as :meth:`estimate` returns it."""
         manifest = self.manifest
         depth = self._plane(output, self._outputs[0])
-        known = np.isfinite(depth)
-        if manifest.output_kind in ("relative", "disparity"):
-            low, high = (depth[known].min(), depth[known].max()) if known.any() else (1.0, 1.0)
-            if low <= 0:
-                depth += max(float(high - low), 1e-6) * np.float32(1e-3) - low
-        else:
-            known &= depth > 0
-            if manifest.output_kind == "metric":
-                depth = np.clip(depth, manifest.min_range_m, manifest.max_range_m)
+        known = np.isfinite(depth) & (depth > 0)
+        if manifest.output_kind == "metric":
+            depth = np.clip(depth, manifest.min_range_m, manifest.max_range_m)
         depth[~known] = 0.0
         return depth
 

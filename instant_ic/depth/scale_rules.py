@@ -100,56 +100,6 @@ def _fullest(values: NDArray[np.float64], width: float) -> tuple[int, int]:
     return first, int(ends[first])
 
 
-def ransac_line(
-    x: Floats, y: Floats, tolerance: Floats, trials: int = 400, seed: int = 0
-) -> tuple[float, float, NDArray[np.bool_]]:
-    """Line y = slope x + offset that most pairs agree on, refined by least squares over those that do.
-
-    Args:
-        x: abscissas of the pairs, (N,).
-        y: ordinates of the pairs, (N,).
-        tolerance: largest distance of each y from the line, (N,); residuals are weighted by its inverse.
-        trials: pairs of points that are tried.
-        seed: seed of the choice of pairs, so that the same input gives the same line.
-
-    Returns:
-        Slope, offset, and which pairs agree, (N,).
-
-    Raises:
-        ScaleError: fewer than ``MIN_VALUES`` pairs, or x does not vary.
-    """
-    if len(x) < MIN_VALUES:
-        raise ScaleError(f"only {len(x)} values, {MIN_VALUES} are needed")
-    x, y, tolerance = (np.asarray(values, np.float64) for values in (x, y, tolerance))
-    if np.ptp(x) < 1e-9:
-        raise ScaleError("the estimated depth is the same everywhere")
-    rng = np.random.default_rng(seed)
-    some = rng.permutation(len(x))[:1500]  # enough to rank the hypotheses
-    a, b = rng.integers(0, len(x), (2, trials))
-    usable = np.abs(x[a] - x[b]) > 0.02 * np.ptp(x)
-    if not usable.any():
-        raise ScaleError("the estimated depth is the same nearly everywhere")
-    a, b = a[usable], b[usable]
-    slopes = (y[a] - y[b]) / (x[a] - x[b])
-    offsets = y[a] - slopes * x[a]
-    misses = np.abs(slopes[:, None] * x[some] + offsets[:, None] - y[some]) / tolerance[some]
-    # Truncated squares rather than a bare count (MSAC): of two lines with as many inliers the closer one wins.
-    best = int(np.argmin((np.minimum(misses, 1.0) ** 2).sum(axis=1)))
-    slope, offset = float(slopes[best]), float(offsets[best])
-    inliers = np.abs(slope * x + offset - y) <= tolerance
-    for _ in range(10):
-        if inliers.sum() < MIN_VALUES or np.ptp(x[inliers]) < 1e-9:
-            raise ScaleError("no line through depth and range has enough points that agree")
-        weights = 1.0 / tolerance[inliers]
-        design = np.column_stack([x[inliers], np.ones(int(inliers.sum()))]) * weights[:, None]
-        slope, offset = (float(value) for value in np.linalg.lstsq(design, y[inliers] * weights, rcond=None)[0])
-        again = np.abs(slope * x + offset - y) <= tolerance
-        if (again == inliers).all():
-            break
-        inliers = again
-    return slope, offset, inliers
-
-
 def sector_factors(
     azimuth_rad: Floats, log_ratio: Floats, sector_deg: float, trust_points: float
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

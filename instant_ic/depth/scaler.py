@@ -15,15 +15,13 @@ from instant_ic.depth.scale_rules import (
     ScaleError,
     consensus_scale,
     max_ratio_scale,
-    ransac_line,
     sector_factors,
 )
 from instant_ic.depth.visibility import azimuth_problem, hidden, nearest_points, on_depth_edge
 
 METHODS = ("max_ratio", "ransac", "sector", "as_estimated")
-OUTPUT_KINDS = ("metric", "scale_invariant", "relative", "disparity")
-"""``metric``: metres. ``scale_invariant``: metres up to one factor. ``relative``: metres up to factor and shift.
-``disparity``: inverse metres up to factor and shift."""
+OUTPUT_KINDS = ("metric", "scale_invariant")
+"""``metric``: metres. ``scale_invariant``: metres up to one factor."""
 AGREEMENT = 0.15
 """A point agrees with depth within this share of its range."""
 _CONFIDENCE = 0.995  # quantile that stands for the maximum, as in the paper
@@ -37,13 +35,13 @@ class ScalerConfig:
 
     Attributes:
         method: sector, ransac, max_ratio (the paper's), as_estimated (not for driving).
-        output_kind: kind of the model's output, as in its manifest: metric, scale_invariant, relative, disparity.
+        output_kind: kind of the model's output, as in its manifest: metric or scale_invariant.
         min_range_m: metres from the camera; nearer points (the robot itself) are left out.
         max_range_m: metres; farther points are left out, farther depth is cut.
         min_points: points on known depth; fewer give no scale.
         min_quality: share of points that agree within 15 %; less and the fit is not trusted.
         max_rival: another scale with more than this share of the scale's points: two fit, none is trusted.
-        min_scale, max_scale: a scale outside makes the fit not ok (``metric`` and ``scale_invariant``).
+        min_scale, max_scale: a scale outside makes the fit not ok.
         assumed_sigma: relative standard deviation published for depth that is used as estimated.
     """
 
@@ -77,8 +75,7 @@ class ScaleFit:
 
     Attributes:
         ok: false: do not trust ``depth_m``; ``message`` says why.
-        scale: metres per unit of depth; for ``disparity``, inverse metres per unit. Of the whole image.
-        shift: metres (``relative``) or inverse metres (``disparity``) added after scaling; else 0.
+        scale: metres per unit of the whole image's depth.
         depth_m: (H, W) float32 scaled radial depth, 0 = unknown.
         quality: share of points whose range agrees with the scaled depth, 0..1.
         relative_sigma: one standard deviation of (depth - range) / range, robust; inf where nothing was compared.
@@ -88,7 +85,6 @@ class ScaleFit:
 
     ok: bool
     scale: float
-    shift: float
     depth_m: NDArray[np.float32]
     quality: float
     relative_sigma: float
@@ -106,12 +102,12 @@ class DepthScaler:
         """Scale one depth image.
 
         Args:
-            depth: (H, W) estimated radial depth (or disparity), 0 = unknown.
+            depth: (H, W) estimated radial depth, 0 = unknown.
             points: (N, 3) LiDAR points in the camera's frame at the image's time, metres.
 
         Returns:
             The fit; where no scale can be found ``ok`` is false, ``scale`` 1 and ``depth_m`` the depth as given
-            (``metric``) or all unknown (other kinds).
+            (``metric``) or all unknown (``scale_invariant``).
 
         Raises:
             ValueError: the arrays have other shapes.
@@ -129,12 +125,12 @@ class DepthScaler:
         """Return a fit that is not ok: depth (H, W) as the model gave it if that is metres, else all unknown."""
         metric = self.config.output_kind == "metric"
         given = self._clean(depth) if metric else np.zeros(depth.shape, np.float32)
-        return ScaleFit(False, 1.0, 0.0, given, 0.0, float("inf"), 0, message)
+        return ScaleFit(False, 1.0, given, 0.0, float("inf"), 0, message)
 
     def as_estimated(self, depth: Floats) -> ScaleFit:
         """Depth (H, W) in the metres of a ``metric`` model, compared with nothing: ok, and the message says so."""
         message = "metres as estimated: the LiDAR was not asked (method as_estimated)"
-        return ScaleFit(True, 1.0, 0.0, self._clean(depth), 0.0, self.config.assumed_sigma, 0, message)
+        return ScaleFit(True, 1.0, self._clean(depth), 0.0, self.config.assumed_sigma, 0, message)
 
     def _fit(self, depth: Floats, points: Floats) -> ScaleFit:
         config = self.config
@@ -149,10 +145,12 @@ class DepthScaler:
             )
         rows, columns, range_m = rows[usable], columns[usable], range_m[usable]
         _check_azimuth(columns, depth.shape[1])
-        scale, shift = self._line(depth[rows, columns], range_m)
-        if scale <= 0:
-            raise ScaleError(f"depth falls where the range grows (slope {scale:.3g})")
-        metres = self._metres(depth, scale, shift)
+        at_points = depth[rows, columns]
+        if config.method == "max_ratio":
+            scale = max_ratio_scale(at_points, range_m, _CONFIDENCE)
+        else:
+            scale = consensus_scale(at_points, range_m, AGREEMENT).scale
+        metres = np.where(_is_known(depth), scale * depth.astype(np.float64), np.nan)
         if config.method == "sector":
             metres = metres * self._field(metres, rows, columns, range_m)
         scaled = metres[rows, columns]
@@ -160,15 +158,14 @@ class DepthScaler:
         quality = float((np.abs(error) <= AGREEMENT).mean())
         finite = error[np.isfinite(error)]
         sigma = 1.4826 * float(np.median(np.abs(finite))) if len(finite) else float("inf")
-        line = f"scale {scale:.3f}" + (f", shift {shift:.3f}" if shift else "")
-        message = f"{line}: {quality:.0%} of {len(range_m)} points within {AGREEMENT:.0%}"
+        message = f"scale {scale:.3f}: {quality:.0%} of {len(range_m)} points within {AGREEMENT:.0%}"
         behind = float((error < -1 / 3).mean())
         if behind > 0.15:
             message += f", {behind:.0%} far behind the depth (glass, a mirror, a doorway?)"
         problem = self._problem(scale, quality, scaled, range_m)
         if problem:
             message = f"{problem}; {message}"
-        return ScaleFit(not problem, scale, shift, self._clean(metres), quality, sigma, len(range_m), message)
+        return ScaleFit(not problem, scale, self._clean(metres), quality, sigma, len(range_m), message)
 
     def _visible(self, points: Floats, height: int, width: int) -> tuple[NDArray[np.intp], NDArray[np.intp], Floats]:
         config = self.config
@@ -183,25 +180,6 @@ class DepthScaler:
         rows, columns, range_m = nearest_points(points[~hidden(points)], width, height)
         _check_azimuth(columns, width)
         return rows, columns, range_m
-
-    def _line(self, at_points: Floats, range_m: Floats) -> tuple[float, float]:
-        """Scale and shift between the model's unit and metres (inverse metres for ``disparity``)."""
-        config = self.config
-        if config.output_kind == "relative":
-            return ransac_line(at_points, range_m, AGREEMENT * range_m)[:2]
-        if config.output_kind == "disparity":
-            return ransac_line(at_points, 1.0 / range_m, AGREEMENT / range_m)[:2]
-        if config.method in ("ransac", "sector"):
-            return consensus_scale(at_points, range_m, AGREEMENT).scale, 0.0
-        return max_ratio_scale(at_points, range_m, _CONFIDENCE), 0.0
-
-    def _metres(self, depth: Floats, scale: float, shift: float) -> NDArray[np.float64]:
-        """Depth (H, W) in metres, not finite where it is unknown."""
-        line = np.where(_is_known(depth), scale * depth.astype(np.float64) + shift, np.nan)
-        if self.config.output_kind == "disparity":
-            # Beyond the longest range the line's offset says nothing any more.
-            return np.asarray(1.0 / np.maximum(line, 1.0 / self.config.max_range_m))
-        return np.asarray(line)
 
     def _field(
         self, metres: Floats, rows: NDArray[np.intp], columns: NDArray[np.intp], range_m: Floats
@@ -219,7 +197,7 @@ class DepthScaler:
     def _problem(self, scale: float, quality: float, scaled: Floats, range_m: Floats) -> str:
         """Why the fit is not to be trusted; empty where it is."""
         config = self.config
-        if config.output_kind in ("metric", "scale_invariant") and not config.min_scale <= scale <= config.max_scale:
+        if not config.min_scale <= scale <= config.max_scale:
             return f"scale {scale:.3g} is outside {config.min_scale} to {config.max_scale}"
         if quality < config.min_quality:
             return f"only {quality:.0%} of the points agree, {config.min_quality:.0%} are needed"

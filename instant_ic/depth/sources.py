@@ -94,7 +94,7 @@ class Prior:
 class DepthResult(ScaleFit):
     """Depth of one image.
 
-    ``scale`` and ``shift``, of the network, are 1 and 0 for ``lidar``. ``quality`` is the share of points whose range
+    ``scale``, of the network, is 1 for ``lidar``. ``quality`` is the share of points whose range
     agrees with the scaled network, before it is fused: how well image and LiDAR fit together; for ``lidar``, with
     ``depth_m``, which has no lonely points in it. ``relative_sigma`` is the median of ``sigma`` over its known pixels.
 
@@ -219,7 +219,7 @@ class DepthSource:
         """Unfit result for an image without points: ``raw`` if that is in metres, else all unknown."""
         if raw is not None:
             return replace(_of_fit(self.scaler.refuse(raw, message)), source=self.config.source)
-        fit = ScaleFit(False, 1.0, 0.0, np.zeros(size, np.float32), 0.0, float("inf"), 0, message)
+        fit = ScaleFit(False, 1.0, np.zeros(size, np.float32), 0.0, float("inf"), 0, message)
         return DepthResult(**vars(fit), sigma=np.full(size, np.inf, np.float32), source=self.config.source)
 
     def network(
@@ -271,7 +271,6 @@ class DepthSource:
             sigma=built.sigma,
             ok=not built.structure.message,
             scale=1.0,
-            shift=0.0,
             quality=quality,
             relative_sigma=_median(built.sigma),
             points=built.structure.points,

@@ -82,7 +82,7 @@ class Scored:
         after: metrics of the result; None without ground truth.
         within_sigma: share of pixels with an error within one sigma; None without LiDAR or truth.
         seconds: wall time of network, scaling and fusion.
-        fit: ``ok``, ``message``, ``scale``, ``shift``, ``quality``, ``relative_sigma`` and ``points`` of the scaling;
+        fit: ``ok``, ``message``, ``scale``, ``quality``, ``relative_sigma`` and ``points`` of the scaling;
             None without LiDAR.
     """
 
@@ -183,7 +183,7 @@ class Evaluator:
         result = self.source.estimate(raw, points, _UP, self.settings.camera_height_m)
         if self.completion is not None:
             result = complete(result, partial(self.completion.complete, rgb))
-        keys = ("ok", "message", "scale", "shift", "quality", "relative_sigma", "points")
+        keys = ("ok", "message", "scale", "quality", "relative_sigma", "points")
         return result.depth_m, result.sigma, {key: _rounded(getattr(result, key)) for key in keys}
 
 

@@ -71,7 +71,7 @@ def read_keyframes(bag: Path) -> list[Shot]:
         sigma = sigma if isinstance(sigma, np.ndarray) else np.full(depth.shape, sigma, np.float32)
         known = sigma[np.isfinite(sigma)]
         middle = float(np.median(known)) if known.size else 1.0
-        result = DepthResult(True, 1.0, 0.0, depth, 1.0, middle, 0, "", sigma, "recorded")
+        result = DepthResult(True, 1.0, depth, 1.0, middle, 0, "", sigma, "recorded")
         found.append(Shot(np.asarray(pose, np.float64), rgb, depth, depth, result, depth))
     return found
 

@@ -27,7 +27,7 @@ def config(tmp_path: Path) -> DepthEstimatorConfig:
     path = tmp_path / "tiny.onnx"
     nodes = tiny_onnx.channel("image", 0, "depth")
     tiny_onnx.write(path, {"image": (1, 3, 64, 128)}, {"depth": (1, 1, 64, 128)}, nodes, tiny_onnx.CHANNELS)
-    manifest = ModelManifest("tiny.onnx", "tiny", "MIT", 64, 128, output_kind="relative")
+    manifest = ModelManifest("tiny.onnx", "tiny", "MIT", 64, 128, output_kind="scale_invariant")
     save_manifest(manifest, path.with_suffix(".yaml"))
     return DepthEstimatorConfig(model=str(path), timeout_s=5.0)
 
@@ -60,7 +60,7 @@ def test_tells_what_its_numbers_are(config: DepthEstimatorConfig) -> None:
         (info,) = bus.messages("/depth/model")
         bus.publish(TOPIC, compressed_image_message(picture(), "camera", START), stamp_ns=START)
         (depth,) = bus.messages("/depth/raw")
-    assert (info.name, info.licence, info.output_kind, info.provider) == ("tiny", "MIT", "relative", "cpu")
+    assert (info.name, info.licence, info.output_kind, info.provider) == ("tiny", "MIT", "scale_invariant", "cpu")
     np.testing.assert_allclose(image_array(depth), 128 / 255, rtol=0.02)
 
 

@@ -119,7 +119,6 @@ def drive(
     lidar: bool = True,
     tf: bool = True,
     network: bool = True,
-    disparity: bool = False,
     body: bool = False,
     base_from_floor: np.ndarray | None = None,
 ) -> None:
@@ -147,8 +146,6 @@ def drive(
             depth = room_depth(base_at(stamp) @ BASE_FROM_CAMERA) / factor
             if body:
                 depth[-len(depth) // 6 :] = 0.3 / factor
-            if disparity:
-                depth = 0.1 + 1 / depth
             bus.publish("/depth/raw", image_message(depth.astype(np.float32), "32FC1", "camera", stamp), stamp_ns=now)
 
 
@@ -371,11 +368,13 @@ def test_a_silent_network_is_told() -> None:
 def test_the_models_own_word_of_its_output_counts() -> None:
     with LockstepBus(START) as bus:
         node = bus.add(DepthScalerNode, DepthScalerConfig(source="network"))
-        info = DepthModelInfo(header=header("", START), name="any", licence="", output_kind="disparity", provider="cpu")
+        info = DepthModelInfo(
+            header=header("", START), name="any", licence="", output_kind="scale_invariant", provider="cpu"
+        )
         bus.publish("/depth/model", info, stamp_ns=START, latched=True)
-        drive(bus, 0.5, disparity=True)
+        drive(bus, 0.5)
         (message,) = bus.messages("/depth/scaled")
-        assert level(node, "model") == (0, "any: disparity depth")
+        assert level(node, "model") == (0, "any: scale_invariant depth")
     assert np.quantile(far_off(image_array(message), stamp_ns(message)), 0.95) < 0.03
 
 

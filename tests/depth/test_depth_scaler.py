@@ -10,7 +10,6 @@ from instant_ic.depth.scale_rules import (
     ScaleError,
     consensus_scale,
     max_ratio_scale,
-    ransac_line,
     sector_factors,
 )
 from instant_ic.depth.scaler import DepthScaler, ScalerConfig
@@ -62,19 +61,6 @@ def test_projection_by_hand() -> None:
     np.testing.assert_allclose(range_m, [2, 3, 1, 4])
 
 
-def test_line_by_ransac_is_exact_under_forty_percent_of_outliers() -> None:
-    x = np.linspace(0, 10, 200)
-    y = 2 * x + 1
-    y[np.arange(200) % 5 < 2] = 30.0  # all alike: a plain robust fit would lean towards them
-    slope, offset, agree = ransac_line(x, y, np.full(200, 0.1))
-    assert (slope, offset) == (pytest.approx(2.0, abs=1e-9), pytest.approx(1.0, abs=1e-9))
-    np.testing.assert_array_equal(agree, np.arange(200) % 5 >= 2)
-    with pytest.raises(ScaleError, match="same everywhere"):
-        ransac_line(np.ones(50), y[:50], np.ones(50))
-    with pytest.raises(ScaleError, match="only 5 values"):
-        ransac_line(x[:5], y[:5], np.ones(5))
-
-
 def test_depth_as_estimated_is_told_as_such_and_asks_no_points() -> None:
     depth = room_depth() * 3.0  # far from what the points say
     config = ScalerConfig(method="as_estimated", assumed_sigma=0.3)
@@ -85,7 +71,7 @@ def test_depth_as_estimated_is_told_as_such_and_asks_no_points() -> None:
     assert ScalerConfig().method != "as_estimated"
     assert not DepthScaler().fit(depth, np.zeros((0, 3))).ok
     with pytest.raises(ValueError, match="as_estimated needs output_kind metric"):
-        ScalerConfig(method="as_estimated", output_kind="disparity")
+        ScalerConfig(method="as_estimated", output_kind="scale_invariant")
 
 
 @pytest.mark.parametrize("method", ["max_ratio", "ransac", "sector"])
@@ -198,21 +184,6 @@ def test_points_on_edges_of_the_depth_are_found() -> None:
     depth[2, 4] = 0.0  # unknown is no edge
     columns = np.arange(8)
     np.testing.assert_array_equal(on_depth_edge(depth, np.full(8, 2), columns), np.isin(columns, (7, 0, 1)))
-
-
-def test_relative_depth_gets_scale_and_shift() -> None:
-    truth = room_depth()
-    fit = DepthScaler(ScalerConfig(output_kind="relative")).fit((truth - 0.5) / 4, room_points())
-    assert fit.ok
-    assert (fit.scale, fit.shift) == (pytest.approx(4.0, rel=0.03), pytest.approx(0.5, abs=0.08))
-
-
-def test_disparity_becomes_metres() -> None:
-    truth = room_depth()
-    fit = DepthScaler(ScalerConfig(output_kind="disparity")).fit(3 / truth + 0.2, room_points())
-    assert fit.ok
-    # The LiDAR's band lacks the near floor and ceiling, so a line through it is a little off there.
-    np.testing.assert_allclose(fit.depth_m, truth, rtol=0.05)
 
 
 def test_reasons_of_a_fit_that_is_not_ok() -> None:

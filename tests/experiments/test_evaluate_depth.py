@@ -171,9 +171,9 @@ def test_scores_before_and_after_scaling():
     json.dumps(figures, allow_nan=False)
 
 
-def test_a_disparity_has_no_metres_before_scaling():
+def test_depth_up_to_a_factor_has_no_metres_before_scaling():
     truth = box_room((128, 256))
-    scored = Evaluator(DepthSettings("network", LidarSettings()), KnownModel(0.4 / truth + 0.1, "disparity")).score(
+    scored = Evaluator(DepthSettings("network", LidarSettings()), KnownModel(0.4 * truth, "scale_invariant")).score(
         "room", RGB, truth
     )
     assert scored.before is None
@@ -219,8 +219,8 @@ def test_what_cannot_be_scored_says_why():
         DepthSettings("network", camera_height_m=0)
     with pytest.raises(DepthEvaluationError, match="needs a model"):
         Evaluator(DepthSettings("network"), None)
-    with pytest.raises(DepthEvaluationError, match="relative"):
-        Evaluator(DepthSettings("network"), KnownModel(box_room(), "relative"))
+    with pytest.raises(DepthEvaluationError, match="scale_invariant"):
+        Evaluator(DepthSettings("network"), KnownModel(box_room(), "scale_invariant"))
     evaluator = Evaluator(DepthSettings("network", LidarSettings()), model)
     with pytest.raises(DepthEvaluationError, match=r"room: the image is 100 x 100"):
         evaluator.score("room", np.zeros((100, 100, 3), np.uint8), box_room())

@@ -148,11 +148,6 @@ def estimated_depth(model: Path | None, rgb: NDArray[np.uint8]) -> NDArray[np.fl
     from instant_ic.util.paths import shipped_file
 
     loaded = DepthModel.load(model or shipped_file("models", DEFAULT_MODEL))
-    kind = loaded.manifest.output_kind
-    if kind not in ("metric", "scale_invariant"):
-        raise UserError(
-            f"{model}: its {kind} depth has no metric scale without a LiDAR; give --depth or a metric model"
-        )
     print(f"no --depth: the scale is an estimate of {loaded.manifest.name}, not measured", file=sys.stderr)
     return loaded.estimate(rgb)
 
