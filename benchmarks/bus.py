@@ -6,75 +6,74 @@
 
 All transports send the same frames at the same pace, alternating within one run, so that other load on the machine
 affects all of them alike. Latency is measured from before the send call until the receiver has read one byte of every
-4096. A transport whose package is missing is "not measured". iceoryx2 is not in the `dev` extra:
-`pip install --no-deps --target FOLDER iceoryx2==0.10.0`, with FOLDER in PYTHONPATH.
+4096. A transport whose package is missing is "not measured".
 """
 
 from __future__ import annotations
 
 import contextlib
-import json
+import multiprocessing
 import os
-import subprocess
-import sys
 import tempfile
 import time
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import bus_transports
+from bus_transports import Receiver
 from reporting import note, parser_for, report, summary
 
 from instant_ic.experiments.stack import free_port
 
-PEER = Path(__file__).with_name("bus_peer.py")
 SIZES = {"b100": 100, "k20": 20_000, "k200": 200_000, "m1": 1_200_000, "m5": 5_500_000}
 PERIOD_S = {"b100": 0.01, "k20": 0.01, "k200": 0.02, "m1": 0.035, "m5": 0.07}
 FANOUT = 4
-QUIET_S = 0.5  # no more messages are expected after this time without one
-
+QUIET_S = 0.5
+"""No more messages are expected after this time without one."""
 NAMES = {
     "ours": "Instant IC, bytes",
     "image": "Instant IC, Image to array",
     "zmq": "ZeroMQ ipc (raw)",
     "zenoh_shm": "Zenoh, shared memory",
-    "iceoryx2": "iceoryx2",
     "lcm": "LCM udpm",
 }
 
 
 class BusPeer:
-    """A process of benchmarks/bus_peer.py."""
+    """A process that sends or receives (benchmarks/bus_transports.py)."""
 
-    def __init__(self, transport: str, role: str, topics: dict[str, int], address: str) -> None:
-        wanted = ",".join(f"{name}={size}" for name, size in topics.items())
-        self.process = subprocess.Popen(
-            [sys.executable, str(PEER), transport, role, wanted, address],
-            stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-        )  # fmt: skip
+    def __init__(self, role: str, transport: str, topics: dict[str, int], address: str) -> None:
+        context = multiprocessing.get_context("spawn")
+        self._channel, theirs = context.Pipe()
+        target = getattr(bus_transports, role)
+        self._process = context.Process(target=target, args=(theirs, transport, topics, address), daemon=True)
+        self._process.start()
+        theirs.close()
 
     def answer(self) -> Any:
-        assert self.process.stdout is not None
-        line = self.process.stdout.readline()
-        if not line:
-            self.process.kill()
-            assert self.process.stderr is not None
-            raise RuntimeError(self.process.stderr.read().strip().splitlines()[-1:] or ["ended without a word"])
-        return json.loads(line)
+        """Return the process's next answer.
 
-    def ask(self, command: dict[str, Any] | None = None) -> Any:
-        assert self.process.stdin is not None
-        self.process.stdin.write(json.dumps(command or {}) + "\n")
-        self.process.stdin.flush()
+        Raises:
+            RuntimeError: the process has failed.
+        """
+        try:
+            found = self._channel.recv()
+        except EOFError:
+            raise RuntimeError("the process ended without an answer") from None
+        if isinstance(found, Exception):
+            raise RuntimeError(f"{type(found).__name__}: {found}")
+        return found
+
+    def ask(self, question: Any) -> Any:
+        """Send a question and return its answer."""
+        self._channel.send(question)
         return self.answer()
 
     def close(self) -> None:
-        if self.process.poll() is None:
-            self.process.kill()
-        self.process.wait(10)
-        for stream in (self.process.stdin, self.process.stdout, self.process.stderr):
-            if stream is not None:
-                stream.close()
+        """Kill the process."""
+        self._process.kill()
+        self._process.join(10)
 
 
 @dataclass
@@ -84,18 +83,18 @@ class PeerPair:
     pub: BusPeer
     subs: list[BusPeer]
 
-    def send(self, topic: str, count: int, period_s: float, seconds: float = 60.0) -> tuple[dict[str, Any], list[Any]]:
-        """Send frames and wait until all expected ones have arrived."""
-        sent = self.pub.ask({"topic": topic, "count": count, "period_s": period_s, "seconds": seconds})
-        got: list[dict[str, Any]] = [sub.ask() for sub in self.subs]
-        quiet_s = time.monotonic() + QUIET_S
-        while min(g["count"] for g in got) < sent["sent"] and time.monotonic() < quiet_s:
+    def send(self, topic: str, count: int, period_s: float, seconds: float = 60.0) -> tuple[int, float, list[Receiver]]:
+        """Send frames, wait until all have arrived, and return count, seconds, and what each reader got."""
+        sent, took = self.pub.ask((topic, count, period_s, seconds))
+        quiet_s, before = time.monotonic() + QUIET_S, 0
+        while time.monotonic() < quiet_s:
+            counts = [sub.ask("count") for sub in self.subs]
+            if min(counts) >= sent:
+                break
+            if sum(counts) > before:
+                quiet_s, before = time.monotonic() + QUIET_S, sum(counts)
             time.sleep(0.05)
-            more = [sub.ask() for sub in self.subs]
-            if any(m["count"] for m in more):
-                quiet_s = time.monotonic() + QUIET_S
-            got = [joined(g, m) for g, m in zip(got, more, strict=True)]
-        return sent, got
+        return sent, took, [sub.ask("all") for sub in self.subs]
 
     def warm_up(self, topic: str) -> None:
         """Wait until every reader receives from the publisher.
@@ -108,29 +107,19 @@ class PeerPair:
         while not all(heard):
             if time.monotonic() > deadline:
                 raise RuntimeError(f"nothing came on {topic}")
-            _, got = self.send(topic, 5, 0.03)
-            heard = [h or g["count"] > 0 for h, g in zip(heard, got, strict=True)]
+            _, _, got = self.send(topic, 5, 0.03)
+            heard = [h or bool(one.latencies_us) for h, one in zip(heard, got, strict=True)]
 
     def close(self) -> None:
+        """Kill both sides."""
         for peer in (self.pub, *self.subs):
             peer.close()
-
-
-def joined(a: dict[str, Any], b: dict[str, Any]) -> dict[str, Any]:
-    """Merge two collections of one receiver."""
-    seconds = a["seconds"] + b["seconds"] if a["count"] and b["count"] else a["seconds"] or b["seconds"]
-    return {
-        "latencies_us": a["latencies_us"] + b["latencies_us"],
-        "count": a["count"] + b["count"],
-        "bytes": a["bytes"] + b["bytes"],
-        "seconds": seconds,
-    }
 
 
 def addresses(folder: Path) -> dict[str, str]:
     """Return the address of each transport."""
     return {
-        **{name: str(folder / name) for name in ("ours", "image", "iceoryx2")},
+        **{name: str(folder / name) for name in ("ours", "image")},
         "zmq": f"ipc://{folder}/zmq",
         "zenoh_shm": f"tcp/127.0.0.1:{free_port()}",
         "lcm": f"udpm://239.255.76.67:{free_port()}?ttl=0&recv_buf_size=4194304",
@@ -143,15 +132,11 @@ def open_pair(transport: str, address: str, topics: dict[str, int], readers: int
     Raises:
         RuntimeError: the transport is not installed or does not work.
     """
-    peers: list[BusPeer] = []
+    peers = [BusPeer(role, transport, topics, address) for role in ("publish", *["receive"] * readers)]
     try:
-        pub = BusPeer(transport, "pub", topics, address)
-        peers.append(pub)
-        pub.answer()
-        for _ in range(readers):
-            peers.append(BusPeer(transport, "sub", topics, address))
-            peers[-1].answer()
-        pair = PeerPair(pub, peers[1:])
+        for peer in peers:
+            peer.answer()
+        pair = PeerPair(peers[0], peers[1:])
         for topic in topics:
             pair.warm_up(topic)
         return pair
@@ -192,8 +177,8 @@ def latencies(pairs: dict[str, PeerPair], rounds: int, count: int) -> dict[str, 
     for turn in range(rounds):
         for topic in SIZES:
             for name, pair in pairs.items():
-                _, got = pair.send(topic, count, PERIOD_S[topic])
-                gathered[name][topic] += got[0]["latencies_us"]
+                _, _, (got,) = pair.send(topic, count, PERIOD_S[topic])
+                gathered[name][topic] += got.latencies_us
         note(f"latency, round {turn + 1} of {rounds}")
     return {name: {size: summary(values, "us") for size, values in sizes.items()} for name, sizes in gathered.items()}
 
@@ -205,11 +190,11 @@ def fanout(address: dict[str, str], rounds: int, count: int) -> dict[str, Any]:
         for name in address:
             try:
                 with contextlib.closing(open_pair(name, address[name], {"m5": SIZES["m5"]}, FANOUT)) as pair:
-                    _, got = pair.send("m5", count, PERIOD_S["m5"])
+                    _, _, got = pair.send("m5", count, PERIOD_S["m5"])
             except RuntimeError as error:
                 note(f"{name}: fan-out not measured: {error}")
                 continue
-            gathered[name] += [value for one in got for value in one["latencies_us"]]
+            gathered[name] += [value for one in got for value in one.latencies_us]
         note("fan-out")
     return {name: summary(values, "us") for name, values in gathered.items()}
 
@@ -220,17 +205,17 @@ def flood(transport: str, address: str, seconds: float) -> dict[str, Any]:
     cells = {}
     with contextlib.closing(open_pair(transport, address, topics, 1)) as pair:
         for topic in topics:
-            written, got = pair.send(topic, 10**9, 0.0, seconds)
-            took = max(written["seconds"], got[0]["seconds"])
+            sent, took, (got,) = pair.send(topic, 10**9, 0.0, seconds)
+            took, count = max(took, (got.last_ns - got.first_ns) / 1e9), len(got.latencies_us)
             cells[topic.removeprefix("flood_")] = {
-                "mb_per_s": round(got[0]["bytes"] / took / 1e6, 1),
-                "messages_per_s": round(got[0]["count"] / took),
-                "delivered": round(got[0]["count"] / max(1, written["sent"]), 4),
+                "mb_per_s": round(got.bytes / took / 1e6, 1),
+                "messages_per_s": round(count / took),
+                "delivered": round(count / max(1, sent), 4),
             }
     return cells
 
 
-def main() -> int:
+def main() -> None:
     parser = parser_for(__doc__)
     parser.add_argument("--quick", action="store_true", help="fewer messages")
     everything = list(NAMES)
@@ -245,8 +230,7 @@ def main() -> int:
         "load_after": os.getloadavg()[0],
     }
     report(result, args.json)
-    return 0
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()
