@@ -23,9 +23,6 @@ UNSHOWN = ("fill", "slam-pose")
 """Sources left out of the strips: they look like others."""
 LABELS = {"psnr_db": "PSNR, dB", "ssim": "SSIM"}
 _TILE_PX = 240
-_COST_S = {"tripod": 12.0, "no-depth": 8.0, "paper": 8.0, "paper-no-scale": 8.0}
-"""Expected CPU seconds of a source; others take one."""
-_BASE_COST_S = 7.0
 
 
 def view_units(
@@ -59,14 +56,13 @@ def view_units(
         "reach_m": 2.0 if options.quick else 4.0,
         **settings,
     }
-    cost_s = (_BASE_COST_S + sum(_COST_S.get(name, 1.0) for name in sources)) * (0.4 if options.quick else 1.0)
     if options.bag is not None:
         common |= {"bag": str(options.bag), "paths": ["straight"], "seed": 0}
         common["sources"] = [name for name in sources if name in RECORDED]
         count = count_keyframes(options.bag) - 1
         chosen = sorted({round(at) for at in np.linspace(0, count - 1, min(options.seeds, count))})
         return [
-            Unit(experiment, {**common, "number": number, "images": keep_images and number == chosen[0]}, cost_s)
+            Unit(experiment, {**common, "number": number, "images": keep_images and number == chosen[0]})
             for number in chosen
         ]
     cases = options.cases(worlds)
@@ -75,7 +71,7 @@ def view_units(
     for world, seed in cases:
         images = keep_images and shown[kind_of(world)] == (world, seed)
         own = {"world": world, "seed": _seed_of(world, seed), "start_seed": seed, **common, "images": images}
-        units.append(Unit(experiment, own, cost_s))
+        units.append(Unit(experiment, own))
     return units
 
 

@@ -15,7 +15,7 @@ import platform
 import time
 import traceback
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -87,12 +87,10 @@ class Unit:
     Attributes:
         experiment: name of its experiment.
         arguments: JSON values on which the result depends, beside the program.
-        cost_s: expected CPU seconds, for the progress.
     """
 
     experiment: str
     arguments: dict[str, Any]
-    cost_s: float = field(default=30.0, compare=False)
 
     @property
     def place(self) -> str:
@@ -158,7 +156,7 @@ def run(
     jobs: int = 1,
     on_result: Callable[[Result], None] = lambda result: None,
     timeout_s: float = 86400.0,
-    unit_timeout_s: float = UNIT_TIMEOUT_S,
+    unit_timeout_s: float | None = UNIT_TIMEOUT_S,
 ) -> list[Result]:
     """Measure all units that have no result in the folder; return the results in the order of the units.
 
@@ -176,7 +174,7 @@ def run(
         on_result(result)
 
     def lost(number: int, error: LostError) -> Result:
-        return Result(waiting[number], {}, unit_timeout_s, 0.0, str(error))
+        return Result(waiting[number], {}, unit_timeout_s or 0.0, 0.0, str(error))
 
     tasks = [(unit, folder) for unit in waiting]
     try:

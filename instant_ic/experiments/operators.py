@@ -17,8 +17,6 @@ from instant_ic.experiments.teleop_worlds import RANDOM_CORRIDORS
 
 METHODS = ("ic", "mesh", "stop")
 """``mesh``: illusory control with the mesh of a ``tripod`` scan without the obstacles."""
-COST_S = {"ic": 22.0, "mesh": 20.0, "stop": 9.0}
-"""CPU seconds of a drive."""
 
 
 def units(options: Options) -> list[Unit]:
@@ -30,7 +28,7 @@ def units(options: Options) -> list[Unit]:
     if options.bag is not None:
         raise ValueError("operators: --bag: a recorded robot does not react to another operator. Leave out --bag")
     return [
-        Unit("operators", {"world": world, "seed": seed, "method": method}, COST_S[method])
+        Unit("operators", {"world": world, "seed": seed, "method": method})
         for world in options.worlds or (RANDOM_CORRIDORS,)
         for seed in range(1 if options.quick else options.seeds)
         for method in METHODS

@@ -1,20 +1,20 @@
 """Calls in several processes; a call that hangs or whose process dies does not end the others.
 
-joblib's ``Parallel`` gives up all calls when one times out or dies. Each process is therefore a loky executor of its
-own, with one worker, which can be killed and replaced alone.
+joblib's ``Parallel`` gives up all calls when one times out or dies. Here each of ``jobs`` threads has a loky executor
+of its own, whose one process is killed and replaced alone.
 """
 
 from __future__ import annotations
 
-import math
 import os
+import queue
 import signal
 import threading
 import time
 import warnings
 from collections import deque
 from collections.abc import Callable, Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, wait
+from concurrent.futures import wait
 from concurrent.futures.process import BrokenProcessPool
 from typing import Any, TypeVar
 
@@ -34,7 +34,7 @@ def run_all(
     prepare: Callable[[], None],
     on_result: Callable[[T], None] | None = None,
     timeout_s: float = 7200.0,
-    call_timeout_s: float = math.inf,
+    call_timeout_s: float | None = None,
     on_lost: Callable[[int, LostError], T] | None = None,
 ) -> list[T]:
     """Call a function for each task's arguments, ``jobs`` at once.
@@ -59,108 +59,91 @@ def run_all(
     """
     if jobs < 1:
         raise ValueError(f"jobs must be at least 1 (got {jobs})")
-    deadline = time.monotonic() + timeout_s
-    results: list[T] = []
-
-    def check_time() -> None:
-        if time.monotonic() > deadline:
-            raise TimeoutError(f"it took longer than {timeout_s:.0f} s; {len(results)} of {len(tasks)} are done")
+    deadline, results = time.monotonic() + timeout_s, list[T]()
+    over = "it took longer than {:.0f} s; {} of {} are done"
 
     def take(result: T) -> None:
         results.append(result)
         if on_result is not None:
             on_result(result)
 
-    if math.isinf(call_timeout_s) and (jobs == 1 or len(tasks) <= 1):
-        _run_here(function, tasks, prepare, take, check_time)
+    if call_timeout_s is None and (jobs == 1 or len(tasks) <= 1):
+        if tasks:
+            prepare()
+        for task in tasks:
+            if time.monotonic() > deadline:
+                raise TimeoutError(over.format(timeout_s, len(results), len(tasks)))
+            take(function(*task))
         return results
-    workers = _Workers(function, tasks, prepare, call_timeout_s)
+    waiting, ended = deque(enumerate(tasks)), queue.SimpleQueue[tuple[int, Any, BaseException | None]]()
+    workers = [_Worker(function, waiting, ended, prepare, call_timeout_s) for _ in range(min(jobs, len(tasks)))]
     try:
-        while workers.start(jobs):
-            check_time()
-            for number, call in workers.ended(deadline):
-                lost = call.exception()
-                if on_lost is not None and isinstance(lost, LostError):
-                    take(on_lost(number, lost))
-                else:
-                    take(call.result())
+        while len(results) < len(tasks):
+            try:
+                number, result, error = ended.get(timeout=max(0.0, deadline - time.monotonic()))
+            except queue.Empty:
+                raise TimeoutError(over.format(timeout_s, len(results), len(tasks))) from None
+            if on_lost is not None and isinstance(error, LostError):
+                take(on_lost(number, error))
+            elif error is not None:
+                raise error
+            else:
+                take(result)
     finally:
-        workers.kill()
+        for worker in workers:
+            worker.kill()
     return results
 
 
-def _run_here(
-    function: Callable[..., T],
-    tasks: Sequence[tuple[Any, ...]],
-    prepare: Callable[[], None],
-    take: Callable[[T], None],
-    check_time: Callable[[], None],
-) -> None:
-    if tasks:
-        prepare()
-    for task in tasks:
-        check_time()
-        take(function(*task))
-
-
-class _Workers:
-    """Processes that each run one call at a time."""
+class _Worker(threading.Thread):
+    """Takes tasks one by one to a process of its own, which is killed and replaced if a call is lost."""
 
     def __init__(
         self,
         function: Callable[..., Any],
-        tasks: Sequence[tuple[Any, ...]],
+        waiting: deque[tuple[int, tuple[Any, ...]]],
+        ended: queue.SimpleQueue[tuple[int, Any, BaseException | None]],
         prepare: Callable[[], None],
-        call_timeout_s: float,
+        call_timeout_s: float | None,
     ) -> None:
+        super().__init__(daemon=True)
         warnings.filterwarnings("ignore", message="A worker stopped while")  # loky renews a process that has grown
-        self._function, self._tasks, self._prepare, self._call_timeout_s = function, tasks, prepare, call_timeout_s
-        self._waiting = deque(range(len(tasks)))
-        self._all: list[ProcessPoolExecutor] = []
-        self._idle: list[ProcessPoolExecutor] = []
-        self._busy: dict[Future[Any], tuple[int, ProcessPoolExecutor, float]] = {}
-        """Task's number, process, and time at which the call must be done."""
+        self._function, self._waiting, self._ended = function, waiting, ended
+        self._prepare, self._call_timeout_s = prepare, call_timeout_s
+        self._executor: ProcessPoolExecutor | None = None
+        self._lock = threading.Lock()
+        self.start()
 
-    def start(self, jobs: int) -> bool:
-        """Start waiting calls while fewer than ``jobs`` run; return whether any runs."""
-        while self._waiting and len(self._busy) < jobs:
-            if not self._idle:
-                self._all.append(ProcessPoolExecutor(1, initializer=_prepare, initargs=(self._prepare, os.getpid())))
-                self._idle.append(self._all[-1])
-            number, executor = self._waiting.popleft(), self._idle.pop()
-            call = executor.submit(self._function, *self._tasks[number])
-            self._busy[call] = number, executor, time.monotonic() + self._call_timeout_s
-        return bool(self._busy)
-
-    def ended(self, deadline: float) -> list[tuple[int, Future[Any]]]:
-        """Wait until a call ends, its limit or ``deadline`` is over; return the calls that ended, with their tasks.
-
-        A call whose process died or was killed has a ``LostError``.
-        """
-        next_s = min(deadline, *(due for _, _, due in self._busy.values())) - time.monotonic()
-        wait(self._busy, max(0.0, next_s), FIRST_COMPLETED)
-        found = []
-        for call, (number, executor, due) in list(self._busy.items()):
-            if call.done():
-                lost = "its process died (out of memory?)" if isinstance(call.exception(), BrokenProcessPool) else ""
-            elif time.monotonic() > due:
-                lost = f"it took longer than {self._call_timeout_s:.0f} s and was ended"
-            else:
-                continue
-            del self._busy[call]
-            if lost:
-                executor.shutdown(kill_workers=True)
-                call = Future()
-                call.set_exception(LostError(lost))
-            else:
-                self._idle.append(executor)
-            found.append((number, call))
-        return found
+    def run(self) -> None:
+        while True:
+            with self._lock:
+                try:
+                    number, task = self._waiting.popleft()
+                except IndexError:
+                    return
+                if self._executor is None:
+                    self._executor = ProcessPoolExecutor(1, initializer=_prepare, initargs=(self._prepare, os.getpid()))
+                call = self._executor.submit(self._function, *task)
+            wait([call], self._call_timeout_s)
+            error = (
+                call.exception()
+                if call.done()
+                else LostError(f"it took longer than {self._call_timeout_s:.0f} s and was ended")
+            )
+            if isinstance(error, BrokenProcessPool):
+                error = LostError("its process died (out of memory?)")
+            if isinstance(error, LostError):
+                with self._lock:
+                    self._executor.shutdown(kill_workers=True)
+                    self._executor = None
+            self._ended.put((number, None if error else call.result(), error))
 
     def kill(self) -> None:
-        """Kill all processes."""
-        for executor in self._all:
-            executor.shutdown(kill_workers=True)
+        """Kill the process, and take no more tasks."""
+        with self._lock:
+            self._waiting.clear()
+            if self._executor is not None:
+                self._executor.shutdown(kill_workers=True)
 
 
 def _prepare(prepare: Callable[[], None], parent: int) -> None:

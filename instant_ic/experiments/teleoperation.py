@@ -43,16 +43,13 @@ class _Recorded(FilmedStack):
         self.frames.append(Moment(self.time_s, shown.virtual, cv2.resize(rgb, SIZE, interpolation=cv2.INTER_AREA)))
 
 
-_COST_S = 60.0
-
-
 def units(options: Options) -> list[Unit]:
     """Return a drive through the corridor's obstacle for each seed, or a recorded drive; images are of the first."""
     if options.bag is not None:
-        return [Unit("teleoperation", {"bag": str(options.bag)}, 10.0)]
+        return [Unit("teleoperation", {"bag": str(options.bag)})]
     cases = options.cases()[: 1 if options.quick else None]
     return [
-        Unit("teleoperation", {"world": world, "seed": number, "images": number == 0}, _COST_S)
+        Unit("teleoperation", {"world": world, "seed": number, "images": number == 0})
         for number, (world, _) in enumerate(cases)
     ]
 

@@ -31,9 +31,8 @@ def units(options: Options) -> list[Unit]:
     times = list(_QUICK_S if options.quick else _TIMES_S)
     keys = ("world", "bag", "number", "seed", "start_seed", "size", "panorama_width")
     return [
-        Unit(one.experiment, {**{k: one.arguments[k] for k in keys if k in one.arguments}, "times_s": times}, cost_s)
+        Unit(one.experiment, {**{k: one.arguments[k] for k in keys if k in one.arguments}, "times_s": times})
         for one in made
-        for cost_s in [2 * max(times) + (3 if options.quick else 10)]
     ]
 
 

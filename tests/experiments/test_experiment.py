@@ -168,12 +168,12 @@ def test_finished_units_are_kept_and_failed_ones_tried_again(tmp_path, monkeypat
 
     monkeypatch.setattr(reconstruction, "measure", measure)
     units = [Unit("reconstruction", {"n": n}) for n in (1, 2)]
-    first = lab.run(units, tmp_path, 1, unit_timeout_s=math.inf)
+    first = lab.run(units, tmp_path, 1, unit_timeout_s=None)
     assert [one.error for one in first] == ["", "no floor here"] and first[0].data["rows"] == [{"value": None}]
-    second = lab.run(units, tmp_path, 1, unit_timeout_s=math.inf)
+    second = lab.run(units, tmp_path, 1, unit_timeout_s=None)
     assert calls == [1, 2, 2] and [one.data["n"] for one in second] == [1, 2]
     (tmp_path / f"{units[0].key}.json").write_text("{")
-    lab.run(units, tmp_path, 1, unit_timeout_s=math.inf)
+    lab.run(units, tmp_path, 1, unit_timeout_s=None)
     assert calls == [1, 2, 2, 1]
     late = lab.run([Unit("reconstruction", {"n": n}) for n in (2, 3)], tmp_path, 1, timeout_s=-1.0)
     assert calls == [1, 2, 2, 1]
@@ -186,7 +186,7 @@ def test_results_of_another_program_or_another_file_are_not_used(tmp_path, monke
     (bag / "a.mcap").write_bytes(b"1")
     unit, world = Unit("reconstruction", {"bag": str(bag)}), Unit("reconstruction", {"world": "corridor:0"})
     first = unit.key, world.key
-    assert (unit.key, world.key) == first and Unit("reconstruction", {"world": "corridor:0"}, 99.0).key == first[1]
+    assert (unit.key, world.key) == first and Unit("reconstruction", {"world": "corridor:0"}).key == first[1]
     (bag / "a.mcap").write_bytes(b"12")
     assert unit.key != first[0] and world.key == first[1]
     monkeypatch.setattr(lab, "program_hash", lambda: "other")
@@ -198,7 +198,7 @@ def test_an_unexpected_error_ends_its_unit_only(tmp_path, monkeypatch) -> None:
         return {"share": 1 / arguments["n"]}
 
     monkeypatch.setattr(reconstruction, "measure", measure)
-    found = lab.run([Unit("reconstruction", {"n": n}) for n in (0, 1)], tmp_path, 1, unit_timeout_s=math.inf)
+    found = lab.run([Unit("reconstruction", {"n": n}) for n in (0, 1)], tmp_path, 1, unit_timeout_s=None)
     assert [one.error for one in found] == ["ZeroDivisionError: division by zero", ""]
 
 
@@ -292,13 +292,6 @@ def test_every_section_is_written_without_results(tmp_path) -> None:
     report.write(tmp_path, sections, [], {})
     assert (tmp_path / "report.html").read_text().count("not measured") >= len(report.PAPER)
     assert {unit.experiment for name in lab.EXPERIMENTS for unit in lab.module(name).units(options)} == {*sections}
-
-
-def test_full_size_fits_into_an_hour_on_two_cores() -> None:
-    units = [unit for name in lab.EXPERIMENTS for unit in lab.module(name).units(Options())]
-    assert sum(unit.cost_s for unit in units) < 0.8 * 2 * 3600
-    quick = [unit for name in lab.EXPERIMENTS for unit in lab.module(name).units(Options(quick=True))]
-    assert sum(unit.cost_s for unit in quick) < 0.8 * 2 * 300
 
 
 def test_places_have_what_they_are_named_for() -> None:

@@ -67,17 +67,14 @@ def _experiment(args: argparse.Namespace) -> int:
     modules = {name: lab.module(name) for name in names}
     units = [unit for module in modules.values() for unit in module.units(options)]
     found = lab.kept(units, folder)
-    known = {result.unit.key for result in found}
-    cost_s = sum(unit.cost_s for unit in units if unit.key not in known)
     conditions = {
         "command": shlex.join(["ic", *sys.argv[1:]]),
         "date": time.strftime("%Y-%m-%d %H:%M UTC", time.gmtime()),
-        "estimate": f"{len(units) - len(found)} of {len(units)} units to measure, {cost_s:.0f} s of CPU time: about "
-        f"{cost_s / 60 / min(args.jobs, os.cpu_count() or 1):.0f} min with {args.jobs} in parallel on free cores",
+        "measured now": f"{len(units) - len(found)} of {len(units)} units, {args.jobs} in parallel",
         **({"left out": "operators: a recorded robot does not react to another operator"} if args.bag else {}),
         **lab.machine(),
     }
-    print(conditions["estimate"], file=sys.stderr, flush=True)
+    print(conditions["measured now"], file=sys.stderr, flush=True)
 
     def write(results: list[lab.Result]) -> None:
         sections = {
@@ -90,18 +87,18 @@ def _experiment(args: argparse.Namespace) -> int:
     folder.mkdir(parents=True, exist_ok=True)
     write(found)  # what there is, before hours of work
     with progress("measuring") as show:
-        done_s = 0.0
+        done = 0
 
         def show_progress(result: lab.Result) -> None:
-            nonlocal done_s
-            done_s += result.unit.cost_s
+            nonlocal done
+            done += 1
             how = f"failed: {result.error}" if result.error else f"{result.wall_s:.0f} s"
-            left_min = (time.monotonic() - began) * (cost_s / done_s - 1) / 60
+            share = done / (len(units) - len(found))
             if sys.stderr.isatty():
-                show(done_s / cost_s, result.unit.experiment)
+                show(share, result.unit.experiment)
             else:
-                line = f"{result.unit.experiment}, {result.unit.place}: {how}; {done_s / cost_s:.0%}"
-                print(f"{line}, about {max(left_min, 0):.0f} min left", file=sys.stderr, flush=True)
+                line = f"{result.unit.experiment}, {result.unit.place}: {how}; {share:.0%}"
+                print(line, file=sys.stderr, flush=True)
 
         results = lab.run(units, folder, args.jobs, show_progress, args.timeout, args.unit_timeout)
     write(results)
