@@ -5,16 +5,20 @@ It acts on the byte stream. TCP users see a lost packet as a stall: everything b
 
 from __future__ import annotations
 
+import argparse
+import asyncio
+import contextlib
 import random
-import selectors
 import socket
 import threading
-import time
-from collections import deque
-from collections.abc import Sequence
 from dataclasses import dataclass
-from types import TracebackType
-from typing import Self
+
+from instant_ic.util.closing import Closing
+
+STALL_S = 0.2
+"""Duration of a retransmission."""
+QUEUE_SEGMENTS, SEGMENT_BYTES = 64, 4096
+"""Router queue of each direction; when it is full the sender is blocked."""
 
 
 @dataclass(frozen=True)
@@ -34,169 +38,91 @@ class Impairment:
     stall_share: float = 0.0
 
 
-STALL_S = 0.2
-"""Duration of a retransmission."""
-_QUEUE_BYTES = 256 * 1024
-"""Router queue; when it is full the sender is blocked."""
-_SEGMENT = 4096
-
-
-class _Way:
-    """One direction of one connection."""
-
-    def __init__(self, source: socket.socket, sink: socket.socket) -> None:
-        self.source, self.sink = source, sink
-        self.queue: deque[tuple[float, bytes]] = deque()
-        self.queued = 0
-        self.free_s = self.last_s = 0.0
-        self.ended = False
-
-
-class ImpairedLink:
-    """Context manager that listens on a port of 127.0.0.1 (0: a free one) and forwards to ``target`` (host, port)."""
+class ImpairedLink(Closing):
+    """Listens on a port of 127.0.0.1 (0: a free one) and forwards to ``target`` (host, port), on its own thread."""
 
     def __init__(self, target: tuple[str, int], impairment: Impairment | None = None, port: int = 0) -> None:
-        self.target = target
-        self.impairment = impairment or Impairment()
-        self._random = random.Random(1)
+        self.target, self.impairment = target, impairment or Impairment()
+        self._random, self._cut = random.Random(1), False
+        self._writers: set[asyncio.StreamWriter] = set()
         self._listener = socket.create_server(("127.0.0.1", port))
         self.port: int = self._listener.getsockname()[1]
-        self._ways: list[_Way] = []
-        self._lock = threading.Lock()
-        self._cut = False
-        self._stalled_until = 0.0
-        self._stop = threading.Event()
+        self._loop, self._ended = asyncio.new_event_loop(), asyncio.Event()
         self._thread = threading.Thread(target=self._run, name="impaired link", daemon=True)
-
-    def __enter__(self) -> Self:
-        """Start the link."""
         self._thread.start()
-        return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        """Stop the link and close every connection."""
-        self._stop.set()
+    def _run(self) -> None:
+        with asyncio.Runner(loop_factory=lambda: self._loop) as runner:
+            runner.run(self._listen())
+
+    async def _listen(self) -> None:
+        server = await asyncio.start_server(self._serve, sock=self._listener)
+        await self._ended.wait()
+        server.close()
+
+    def close(self) -> None:
+        """End the link and every connection."""
+        self.mend()
+        self._loop.call_soon_threadsafe(self._ended.set)
         self._thread.join(5)
-        self._listener.close()
-        self._drop_all()
-
-    def stall(self, seconds: float) -> None:
-        """Stop forwarding for a while; no byte is lost."""
-        self._stalled_until = time.monotonic() + seconds
 
     def cut(self) -> None:
-        """Simulate an outage until :meth:`mend`: bytes are dropped silently, and new connections get no answer."""
+        """Simulate an outage until :meth:`mend`: bytes are dropped silently, and new connections are closed."""
         self._cut = True
 
     def mend(self) -> None:
-        """End the outage; earlier connections stay dead, as after a long outage."""
-        self._drop_all()
-        self._cut = False
+        """End the outage; earlier connections are closed, as after a long outage."""
 
-    def _drop_all(self) -> None:
-        with self._lock:
-            for way in self._ways:
-                way.source.close()
-            self._ways.clear()
+        def drop() -> None:
+            for writer in self._writers:
+                writer.transport.abort()
+            self._cut = False
 
-    def _accept(self) -> None:
-        near, _ = self._listener.accept()
-        if self._cut:
-            near.close()
-            return
+        self._loop.call_soon_threadsafe(drop)
+
+    async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        ends = [writer]
+        with contextlib.suppress(OSError, asyncio.CancelledError):
+            if not self._cut:
+                far_reader, far_writer = await asyncio.open_connection(*self.target)
+                ends.append(far_writer)
+                self._writers.update(ends)
+                await asyncio.gather(self._forward(reader, far_writer), self._forward(far_reader, writer))
+        while self._cut and len(ends) > 1:  # an end that closes during an outage is not seen by the other
+            await asyncio.sleep(0.02)
+        self._writers.difference_update(ends)
+        for end in ends:
+            end.close()
+
+    async def _forward(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        """Forward one direction of a connection until its sender ends it."""
+        waiting: asyncio.Queue[tuple[float, bytes]] = asyncio.Queue(QUEUE_SEGMENTS)
+        sender = asyncio.create_task(self._send(waiting, writer))
+        bad, free_s, last_s, data = self.impairment, 0.0, 0.0, b"-"
         try:
-            far = socket.create_connection(self.target, timeout=0.5)  # blocks all other connections meanwhile
-        except OSError:
-            near.close()
-            return
-        for each in (near, far):
-            each.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-            each.setblocking(False)
-        with self._lock:
-            self._ways += [_Way(near, far), _Way(far, near)]
+            while data:
+                data = await reader.read(SEGMENT_BYTES)
+                free_s = max(self._loop.time(), free_s)
+                free_s += len(data) / bad.rate_bytes_s if bad.rate_bytes_s else 0.0
+                due = free_s + bad.delay_s + self._random.uniform(-bad.jitter_s, bad.jitter_s)
+                last_s = max(last_s, due + STALL_S * (self._random.random() < bad.stall_share))
+                await waiting.put((last_s, data))
+            await sender
+        finally:
+            sender.cancel()
 
-    def _run(self) -> None:
-        selector = selectors.DefaultSelector()
-        selector.register(self._listener, selectors.EVENT_READ)
-        while not self._stop.is_set():
-            with self._lock:
-                ways = list(self._ways)
-            wanted = {way.source: way for way in ways if way.queued < _QUEUE_BYTES and not way.ended}
-            for key in list(selector.get_map().values()):
-                if key.fileobj is not self._listener and key.fileobj not in wanted:
-                    selector.unregister(key.fileobj)
-            for source in wanted:
-                if source.fileno() >= 0 and source not in selector.get_map():
-                    selector.register(source, selectors.EVENT_READ)
-            now = time.monotonic()
-            dues = [way.queue[0][0] for way in ways if way.queue]
-            events = selector.select(max(0.0, min(0.02, min(dues, default=now + 1) - now)))
-            for key, _ in events:
-                if key.fileobj is self._listener:
-                    self._accept()
-                else:
-                    self._read(wanted[key.fileobj])  # type: ignore[index]
-            for way in ways:
-                self._write(way)
-        selector.close()
-
-    def _read(self, way: _Way) -> None:
-        try:
-            data = way.source.recv(_SEGMENT)
-        except BlockingIOError:
-            return
-        except OSError:
-            data = b""
-        if self._cut:
-            return
-        if not data:
-            way.ended = True
-            return
-        bad, now = self.impairment, time.monotonic()
-        begin = max(now, way.free_s)
-        way.free_s = begin + (len(data) / bad.rate_bytes_s if bad.rate_bytes_s else 0.0)
-        due = way.free_s + bad.delay_s + self._random.uniform(-bad.jitter_s, bad.jitter_s)
-        if self._random.random() < bad.stall_share:
-            due += STALL_S
-        way.last_s = max(way.last_s, due)
-        way.queue.append((way.last_s, data))
-        way.queued += len(data)
-
-    def _write(self, way: _Way) -> None:
-        now = time.monotonic()
-        if self._cut:
-            way.queue.clear()
-            way.queued = 0
-            return
-        try:
-            while way.queue and way.queue[0][0] <= now and now >= self._stalled_until:
-                due, data = way.queue[0]
-                sent = way.sink.send(data)
-                way.queued -= sent
-                if sent < len(data):
-                    way.queue[0] = (due, data[sent:])
-                    return
-                way.queue.popleft()
-            if way.ended and not way.queue:
-                way.sink.close()
-        except BlockingIOError:
-            return
-        except OSError:
-            way.ended = True
-            way.queue.clear()
-        if way.ended and not way.queue:
-            with self._lock:
-                self._ways = [w for w in self._ways if w.source not in (way.source, way.sink)]
-            way.source.close()
-            way.sink.close()
+    async def _send(self, waiting: asyncio.Queue[tuple[float, bytes]], writer: asyncio.StreamWriter) -> None:
+        data = b"-"
+        while data:
+            due, data = await waiting.get()
+            await asyncio.sleep(due - self._loop.time())
+            if not self._cut:
+                writer.write(data) if data else writer.write_eof()
+                await writer.drain()
 
 
-def main(argv: Sequence[str] | None = None) -> int:
+def main() -> None:
     """Run a link until it is stopped: ``python benchmarks/impaired_link.py 7451 10.0.0.1 7450``."""
-    import argparse
-
     parser = argparse.ArgumentParser(description="TCP proxy that behaves as a bad network.")
     parser.add_argument("port", type=int, help="port of 127.0.0.1 to listen on")
     parser.add_argument("target_host")
@@ -205,12 +131,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--jitter-ms", type=float, default=0.0, help="added, uniform in plus and minus")
     parser.add_argument("--rate-mbit", type=float, default=0.0, help="0: unlimited")
     parser.add_argument("--stall-share", type=float, default=0.0, help="share of segments that wait, as after a loss")
-    args = parser.parse_args(argv)
+    args = parser.parse_args()
     impairment = Impairment(args.delay_ms / 1e3, args.jitter_ms / 1e3, args.rate_mbit * 1e6 / 8, args.stall_share)
     with ImpairedLink((args.target_host, args.target_port), impairment, port=args.port):
         threading.Event().wait()
-    return 0
 
 
 if __name__ == "__main__":
-    raise SystemExit(main())
+    main()

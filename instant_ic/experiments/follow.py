@@ -302,7 +302,11 @@ def prepare() -> None:
 
 
 def evaluate(
-    episodes: int, seed: int, jobs: int, on_episode: Callable[[Episode], None] | None = None, timeout_s: float = 3600.0
+    episodes: int,
+    seed: int,
+    jobs: int,
+    on_episode: Callable[[Episode], None] = lambda episode: None,
+    timeout_s: float = 3600.0,
 ) -> list[Episode]:
     """Run all episodes, ``jobs`` in parallel; with more than one job, each in its own process.
 
@@ -314,7 +318,10 @@ def evaluate(
     if episodes < 1:
         raise ValueError(f"episodes must be at least 1 (got {episodes})")
     tasks = [(seed, index) for index in range(episodes)]
-    done = run_all(run_episode, tasks, jobs, prepare, on_episode, timeout_s)
+    done: list[Episode] = []
+    for episode in run_all(run_episode, tasks, jobs, prepare, timeout_s):
+        done.append(episode)
+        on_episode(episode)
     return sorted(done, key=lambda episode: episode.index)
 
 

@@ -84,7 +84,10 @@ def film_episode(settings: TeleopSettings, index: int) -> Film:
 
 
 def evaluate(
-    settings: TeleopSettings, jobs: int = 1, on_film: Callable[[Film], None] | None = None, timeout_s: float = 7200.0
+    settings: TeleopSettings,
+    jobs: int = 1,
+    on_film: Callable[[Film], None] = lambda film: None,
+    timeout_s: float = 7200.0,
 ) -> list[Film]:
     """Film all episodes, ``jobs`` in parallel; with more than one job, each in its own process.
 
@@ -94,7 +97,10 @@ def evaluate(
         RuntimeError: a process died, or a stack did not become ready.
     """
     tasks = [(settings, index) for index in range(settings.episodes)]
-    films = run_all(film_episode, tasks, jobs, warm_up, on_film, timeout_s)
+    films: list[Film] = []
+    for film in run_all(film_episode, tasks, jobs, warm_up, timeout_s):
+        films.append(film)
+        on_film(film)
     return sorted(films, key=lambda film: film.index)
 
 

@@ -169,16 +169,13 @@ def run(
     waiting = [unit for unit in units if unit.key not in found]
     waiting.sort(key=lambda unit: int(unit.arguments.get("seed", 0)))
 
-    def take(result: Result) -> None:
-        found[result.unit.key] = result
-        on_result(result)
-
-    def lost(number: int, error: LostError) -> Result:
-        return Result(waiting[number], {}, unit_timeout_s or 0.0, 0.0, str(error))
-
     tasks = [(unit, folder) for unit in waiting]
     try:
-        run_all(measure, tasks, jobs, _nothing, take, timeout_s, unit_timeout_s, lost)
+        for result in run_all(measure, tasks, jobs, _nothing, timeout_s, unit_timeout_s):
+            if isinstance(result, LostError):
+                result = Result(waiting[result.number], {}, unit_timeout_s or 0.0, 0.0, str(result))
+            found[result.unit.key] = result
+            on_result(result)
     except TimeoutError:
         missing = f"not measured: the time limit of {timeout_s:.0f} s was over"
         found = {unit.key: Result(unit, {}, 0.0, 0.0, missing) for unit in units} | found

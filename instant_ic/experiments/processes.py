@@ -13,86 +13,75 @@ import threading
 import time
 import warnings
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import wait
 from concurrent.futures.process import BrokenProcessPool
-from typing import Any, TypeVar
+from typing import Any
 
 from joblib.externals.loky import ProcessPoolExecutor
 
-T = TypeVar("T")
-
 
 class LostError(RuntimeError):
-    """A call without a result: its process died, or was ended because the call took too long."""
+    """A call without a result: its process died, or was ended because the call took too long.
+
+    ``number`` is that of the call's task.
+    """
+
+    number = -1
 
 
 def run_all(
-    function: Callable[..., T],
+    function: Callable[..., Any],
     tasks: Sequence[tuple[Any, ...]],
     jobs: int,
     prepare: Callable[[], None],
-    on_result: Callable[[T], None] | None = None,
     timeout_s: float = 7200.0,
     call_timeout_s: float | None = None,
-    on_lost: Callable[[int, LostError], T] | None = None,
-) -> list[T]:
-    """Call a function for each task's arguments, ``jobs`` at once.
+) -> Iterator[Any]:
+    """Call a function for each task's arguments, ``jobs`` at once; yield the results in the order of completion.
 
     Args:
         function: function of a module, so that other processes find it.
         tasks: positional arguments of each call.
         jobs: number of processes; one, without ``call_timeout_s``: this process.
         prepare: called first in each process.
-        on_result: called with each result as it arrives.
         timeout_s: time limit for all calls.
-        call_timeout_s: time limit for one call; its process is then killed.
-        on_lost: returns the result of a lost call from the task's number and the error; None: raise.
-
-    Returns:
-        Results in the order of completion.
+        call_timeout_s: time limit for one call, whose process is then killed. With it the result of a lost call is its
+            error.
 
     Raises:
         ValueError: ``jobs`` is less than 1.
         TimeoutError: the calls took longer than ``timeout_s``.
-        LostError: a process died or was killed, and there is no ``on_lost``.
+        LostError: a process died, without ``call_timeout_s``.
     """
     if jobs < 1:
         raise ValueError(f"jobs must be at least 1 (got {jobs})")
-    deadline, results = time.monotonic() + timeout_s, list[T]()
-    over = "it took longer than {:.0f} s; {} of {} are done"
-
-    def take(result: T) -> None:
-        results.append(result)
-        if on_result is not None:
-            on_result(result)
-
+    deadline, late = (
+        time.monotonic() + timeout_s,
+        f"it took longer than {timeout_s:.0f} s; {{}} of {len(tasks)} are done",
+    )
     if call_timeout_s is None and (jobs == 1 or len(tasks) <= 1):
         if tasks:
             prepare()
-        for task in tasks:
+        for number, task in enumerate(tasks):
             if time.monotonic() > deadline:
-                raise TimeoutError(over.format(timeout_s, len(results), len(tasks)))
-            take(function(*task))
-        return results
-    waiting, ended = deque(enumerate(tasks)), queue.SimpleQueue[tuple[int, Any, BaseException | None]]()
+                raise TimeoutError(late.format(number))
+            yield function(*task)
+        return
+    waiting, ended = deque(enumerate(tasks)), queue.SimpleQueue[tuple[Any, BaseException | None]]()
     workers = [_Worker(function, waiting, ended, prepare, call_timeout_s) for _ in range(min(jobs, len(tasks)))]
     try:
-        while len(results) < len(tasks):
+        for done in range(len(tasks)):
             try:
-                number, result, error = ended.get(timeout=max(0.0, deadline - time.monotonic()))
+                result, error = ended.get(timeout=max(0.0, deadline - time.monotonic()))
             except queue.Empty:
-                raise TimeoutError(over.format(timeout_s, len(results), len(tasks))) from None
-            if on_lost is not None and isinstance(error, LostError):
-                take(on_lost(number, error))
-            elif error is not None:
+                raise TimeoutError(late.format(done)) from None
+            if error is not None and (call_timeout_s is None or not isinstance(error, LostError)):
                 raise error
-            else:
-                take(result)
+            yield result if error is None else error
     finally:
         for worker in workers:
             worker.kill()
-    return results
 
 
 class _Worker(threading.Thread):
@@ -102,7 +91,7 @@ class _Worker(threading.Thread):
         self,
         function: Callable[..., Any],
         waiting: deque[tuple[int, tuple[Any, ...]]],
-        ended: queue.SimpleQueue[tuple[int, Any, BaseException | None]],
+        ended: queue.SimpleQueue[tuple[Any, BaseException | None]],
         prepare: Callable[[], None],
         call_timeout_s: float | None,
     ) -> None:
@@ -133,10 +122,11 @@ class _Worker(threading.Thread):
             if isinstance(error, BrokenProcessPool):
                 error = LostError("its process died (out of memory?)")
             if isinstance(error, LostError):
+                error.number = number
                 with self._lock:
                     self._executor.shutdown(kill_workers=True)
                     self._executor = None
-            self._ended.put((number, None if error else call.result(), error))
+            self._ended.put((None if error else call.result(), error))
 
     def kill(self) -> None:
         """Kill the process, and take no more tasks."""

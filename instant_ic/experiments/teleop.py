@@ -240,7 +240,7 @@ def _quiet() -> Iterator[None]:
 def evaluate(
     settings: TeleopSettings,
     jobs: int = 1,
-    on_drive: Callable[[TeleopDrive], None] | None = None,
+    on_drive: Callable[[TeleopDrive], None] = lambda drive: None,
     timeout_s: float = 7200.0,
 ) -> list[TeleopDrive]:
     """Drive all courses by all methods, ``jobs`` drives in parallel; with more than one job, each in its own process.
@@ -261,7 +261,10 @@ def evaluate(
     """
     tasks = [(settings, i, name) for i in range(settings.episodes) for name in settings.methods]
     # The kernels are compiled first, so that no episode includes that time.
-    drives = run_all(_drive, tasks, jobs, warm_up, on_drive, timeout_s)
+    drives: list[TeleopDrive] = []
+    for drive in run_all(_drive, tasks, jobs, warm_up, timeout_s):
+        drives.append(drive)
+        on_drive(drive)
     return sorted(drives, key=lambda drive: (drive.index, METHODS.index(drive.method)))
 
 

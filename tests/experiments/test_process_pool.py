@@ -33,15 +33,10 @@ def left(folder: Path) -> list[Path]:
 
 
 def test_a_call_that_hangs_or_dies_is_lost_and_the_others_are_done(tmp_path: Path) -> None:
-    lost = []
-
-    def on_lost(number: int, error: LostError) -> str:
-        lost.append((number, str(error)))
-        return "lost"
-
     tasks = [(how, tmp_path) for how in ("hang", "one", "die", "two")]
-    results = run_all(behave, tasks, 2, nothing, None, 600.0, 4.0, on_lost)
-    assert sorted(results) == ["lost", "lost", "one", "two"]
+    results = list(run_all(behave, tasks, 2, nothing, 600.0, 4.0))
+    assert sorted(one for one in results if isinstance(one, str)) == ["one", "two"]
+    lost = [(one.number, str(one)) for one in results if isinstance(one, LostError)]
     assert sorted(lost) == [(0, "it took longer than 4 s and was ended"), (2, "its process died (out of memory?)")]
     assert not left(tmp_path)
 
@@ -56,7 +51,7 @@ def test_a_call_that_hangs_or_dies_is_lost_and_the_others_are_done(tmp_path: Pat
 )
 def test_the_run_ends_with_the_error_of_a_call(tasks, timeout_s, error, words, tmp_path: Path) -> None:
     with pytest.raises(error, match=words):
-        run_all(behave, [(how, tmp_path) for how in tasks], 2, nothing, timeout_s=timeout_s)
+        list(run_all(behave, [(how, tmp_path) for how in tasks], 2, nothing, timeout_s))
     assert not left(tmp_path)
 
 
@@ -70,7 +65,7 @@ def test_an_interrupt_leaves_no_process(tmp_path: Path) -> None:
     threading.Thread(target=interrupt, daemon=True).start()
     try:
         with pytest.raises(KeyboardInterrupt):
-            run_all(behave, [("hang", tmp_path)] * 2, 2, nothing)
+            list(run_all(behave, [("hang", tmp_path)] * 2, 2, nothing))
     finally:
         signal.signal(signal.SIGINT, before)
     assert not left(tmp_path)
