@@ -16,8 +16,7 @@ from instant_ic.console.config import ConsoleConfig
 from instant_ic.console.display import Display
 from instant_ic.console.faults import ERROR, OK, WARN, FaultList
 from instant_ic.console.gridimage import GridLayers
-from instant_ic.console.layer_meshes import LayerMeshes
-from instant_ic.console.layers import MOST_LAYERS, PageLayers
+from instant_ic.console.layers import MOST_LAYERS, LayerMeshes, PageLayers
 from instant_ic.console.protocol import FrameKind, PageProtocolError
 from instant_ic.console.robot_poses import RobotPoses
 from instant_ic.console.server import PLAIN_HTTP

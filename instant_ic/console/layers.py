@@ -1,20 +1,32 @@
-"""Layers of the virtual space that the page renders by itself, and the frame that carries them."""
+"""Layers of the virtual space that the page renders by itself, and the frame that carries them.
+
+A layer is a panorama with depth, as triangles. The layers of seen surfaces come before those of estimated ones behind
+them.
+"""
 
 from __future__ import annotations
 
 import hashlib
-from dataclasses import dataclass
+from collections.abc import Hashable
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from instant_ic.console.protocol import PageProtocolError
 from instant_ic.geometry.poses import Matrix, quaternion_from_matrix
+from instant_ic.vspace.layer_mesh import LayerMesh, layer_mesh
+from instant_ic.vspace.layers import Content, Kind, Layer, Layers, LayersError, decode_layer
+from instant_ic.vspace.prior import edge_quads
 
 MOST_LAYERS = 8
 """Largest number of layers; the page marks each by a bit of its stencil buffer."""
+EDGE_RATIO = 0.2
+"""Relative difference of depth above which two neighbours are an edge. With noisy depth, a smaller value would tear the
+surface into shards (0.7 dB in the corridor's live keyframes)."""
 
 
 def pose_fields(map_from_camera: Matrix) -> dict[str, list[float]]:
@@ -24,35 +36,29 @@ def pose_fields(map_from_camera: Matrix) -> dict[str, list[float]]:
 
 @dataclass(frozen=True)
 class PageLayer:
-    """A surface around a keyframe, as triangles with an equirectangular image (``vspace.layer_mesh``).
+    """A surface around a keyframe.
 
     Attributes:
-        image: colours, JPEG or PNG.
+        image: colours, JPEG or PNG, equirectangular.
         confidence: grey PNG, white where the place was seen; empty if all of it was seen.
-        gain: factors of the colours: red, green, blue.
+        mesh: triangles. An inverse depth of 0 is infinitely far.
         map_from_camera: pose of the keyframe's camera, (4, 4).
-        size: height and width of the lattice that the corners belong to.
-        corners: column and row of each vertex, (N, 2) uint16.
-        inverse_depth: inverse depth of each vertex, 1/m along the ray, (N,) float32; 0 is infinitely far.
-        triangles: indices of the vertices, (T, 3) uint32, counter-clockwise as seen by the keyframe's camera.
+        gain: factors of the colours: red, green, blue.
     """
 
     image: bytes
     confidence: bytes
-    gain: tuple[float, float, float]
+    mesh: LayerMesh
     map_from_camera: Matrix
-    size: tuple[int, int]
-    corners: NDArray[np.uint16]
-    inverse_depth: NDArray[np.float32]
-    triangles: NDArray[np.uint32]
+    gain: tuple[float, float, float] = (1.0, 1.0, 1.0)
 
     @cached_property
     def parts(self) -> dict[str, bytes]:
         """Bytes of the layer by name, arrays in little endian. Numbers come first, so that they stay aligned."""
         return {
-            "inverse": self.inverse_depth.astype("<f4").tobytes(),
-            "triangles": self.triangles.astype("<u4").tobytes(),
-            "corners": self.corners.astype("<u2").tobytes(),
+            "inverse": self.mesh.inverse_depth.astype("<f4").tobytes(),
+            "triangles": self.mesh.triangles.astype("<u4").tobytes(),
+            "corners": self.mesh.corners.astype("<u2").tobytes(),
             "image": self.image,
             "confidence": self.confidence,
         }
@@ -60,19 +66,10 @@ class PageLayer:
     @cached_property
     def digest(self) -> str:
         """Digest of image, confidence and triangles."""
-        content = hashlib.blake2b(repr(self.size).encode(), digest_size=12)
+        content = hashlib.blake2b(repr(self.mesh.size).encode(), digest_size=12)
         for part in self.parts.values():
             content.update(len(part).to_bytes(8, "little") + part)
         return content.hexdigest()
-
-    def check(self, name: str) -> None:
-        """Check the fields of a layer that come from a message; raise PageProtocolError, which names the field."""
-        if not np.isfinite(self.gain).all():
-            raise PageProtocolError(f"{name}.gain must be 3 finite numbers (got {self.gain})")
-        if not np.isfinite(self.map_from_camera).all():
-            raise PageProtocolError(f"{name}.map_from_camera must be 4 x 4 finite numbers")
-        if not self.image:
-            raise PageProtocolError(f"{name}.image is empty")
 
 
 @dataclass(frozen=True)
@@ -90,15 +87,21 @@ class PageLayers:
     layers: tuple[PageLayer, ...]
 
     def check(self) -> None:
-        """Check all layers; raise PageProtocolError, which names what is wrong."""
-        if not 1 <= self.version <= 2**53:
-            raise PageProtocolError(f"layers.version must be from 1 to 2**53 (got {self.version})")
-        if not 1 <= len(self.layers) <= MOST_LAYERS:
-            raise PageProtocolError(f"layers: there must be 1 to {MOST_LAYERS} (got {len(self.layers)})")
-        if not np.isfinite(self.mount).all():
-            raise PageProtocolError(f"layers.mount must be 3 finite numbers (got {self.mount})")
+        """Check what comes from a message.
+
+        Raises:
+            PageProtocolError: a page could not render it; the text names the field.
+        """
+        _require(1 <= self.version <= 2**53, f"layers.version must be from 1 to 2**53 (got {self.version})")
+        _require(
+            1 <= len(self.layers) <= MOST_LAYERS, f"layers: there must be 1 to {MOST_LAYERS} (got {len(self.layers)})"
+        )
+        _require(np.isfinite(self.mount).all(), f"layers.mount must be 3 finite numbers (got {self.mount})")
         for number, layer in enumerate(self.layers):
-            layer.check(f"layers[{number}]")
+            name = f"layers[{number}]"
+            _require(np.isfinite(layer.gain).all(), f"{name}.gain must be 3 finite numbers (got {layer.gain})")
+            _require(np.isfinite(layer.map_from_camera).all(), f"{name}.map_from_camera must be 4 x 4 finite numbers")
+            _require(bool(layer.image), f"{name}.image is empty")
 
     @cached_property
     def digests(self) -> frozenset[str]:
@@ -119,10 +122,85 @@ class PageLayers:
             layers.append(
                 {
                     "id": layer.digest,
-                    "size": list(layer.size),
+                    "size": list(layer.mesh.size),
                     "gain": list(layer.gain),
                     **pose_fields(layer.map_from_camera),
                     "parts": ranges,
                 }
             )
         return {"version": self.version, "mount": list(self.mount), "layers": layers}, bytes(payload)
+
+
+def _require(fine: bool | np.bool_, text: str) -> None:
+    if not fine:
+        raise PageProtocolError(text)
+
+
+class LayerMeshes:
+    """The page's layers of each version; a layer that has not changed since the last call is reused."""
+
+    def __init__(self) -> None:
+        self._before: dict[Hashable, PageLayer] = {}
+
+    def layers(self, version: Layers) -> tuple[PageLayer, ...]:
+        """Return the layers in the order in which the page shows them: seen surfaces first, then the estimated ones.
+
+        Args:
+            version: a whole version of the virtual space.
+
+        Raises:
+            LayersError: no layer was seen by a camera, or a layer cannot be decoded.
+        """
+        if not any(layer.kind is Kind.SEEN for layer in version.layers):
+            raise LayersError("the layers hold no keyframe")
+        made: dict[Hashable, PageLayer] = {}
+        for layer in sorted(version.layers, key=lambda layer: layer.kind):  # stable
+            key = layer.kind, layer.keyframe_id, layer.colour_version, layer.geometry_version
+            made[key] = _layer(layer, self._before.get(key))
+        self._before = made
+        return tuple(made.values())
+
+
+def _layer(layer: Layer, before: PageLayer | None) -> PageLayer:
+    red, green, blue = (float(value) for value in layer.gain)
+    if before is not None:
+        if before.gain == (red, green, blue) and np.array_equal(before.map_from_camera, layer.map_from_camera):
+            return before
+        return replace(before, gain=(red, green, blue), map_from_camera=layer.map_from_camera)
+    decoded = decode_layer(layer)
+    confidence = None if layer.kind is Kind.SEEN else decoded.confidence
+    shown = decoded.content == Content.SURFACE if confidence is None else decoded.content > Content.NOTHING
+    made = page_layer(layer.colour, decoded.inverse_depth, shown, confidence, layer.map_from_camera)
+    return replace(made, gain=(red, green, blue))
+
+
+def page_layer(
+    colour: bytes,
+    inverse_depth: NDArray[np.float32],
+    shown: NDArray[np.bool_],
+    confidence: NDArray[np.floating] | None,
+    map_from_camera: Matrix,
+) -> PageLayer:
+    """Return one panorama with depth as triangles, in its own colours.
+
+    Args:
+        colour: JPEG or PNG, equirectangular.
+        inverse_depth: in 1/m along the ray, > 0, (h, 2 h).
+        shown: True where there is a surface, (h, 2 h): by pixel, or for an estimated surface by the quad right of and
+            below the pixel.
+        confidence: confidence of an estimated surface, 0 to 1, (h', w'); None if all of it was seen.
+        map_from_camera: pose of the keyframe's camera, (4, 4).
+
+    Raises:
+        ValueError: the geometry is not a surface.
+    """
+    if confidence is not None:
+        for axis in (0, 1):  # a quad has four pixels
+            shown = shown | np.roll(shown, 1, axis)
+    mesh = layer_mesh(inverse_depth, edge_quads(inverse_depth, EDGE_RATIO), shown)
+    return PageLayer(colour, b"" if confidence is None else _confidence_png(confidence), mesh, map_from_camera)
+
+
+def _confidence_png(confidence: NDArray[np.floating]) -> bytes:
+    """Encode shares (h, w) from 0 to 1 as a grey image."""
+    return cv2.imencode(".png", np.rint(255 * confidence).astype(np.uint8))[1].tobytes()

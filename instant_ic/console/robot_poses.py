@@ -6,7 +6,7 @@ import numpy as np
 
 from instant_ic.bus.topics import Latest
 from instant_ic.config.robot import Mount
-from instant_ic.geometry.poses import Matrix, pose2_from_matrix, transform_points
+from instant_ic.geometry.poses import Matrix, pose2_from_matrix
 from instant_ic.geometry.transforms import TransformBuffer, TransformError
 from instant_ic.msg import Path, matrix_from_pose, path_array
 
@@ -54,16 +54,11 @@ class RobotPoses:
         return mount
 
     def points(self, path: Path | None) -> list[list[float]]:
-        """Return the points [x, y] of a path in the map frame, rounded to 1 mm; empty without a path."""
-        if path is None or not path.poses:
+        """Return the points [x, y] of a path in the map frame, rounded to 1 mm; empty without one in this frame."""
+        if path is None or not path.poses or path.header.frame_id not in ("", "map"):
             return []
-        xyz = np.pad(path_array(path)[:, :2], ((0, 0), (0, 1)))
-        if path.header.frame_id not in ("", "map"):
-            map_from_frame = self.lookup("map", path.header.frame_id)
-            if map_from_frame is None:
-                return []
-            xyz = transform_points(map_from_frame, xyz).astype(np.float64)
-        points: list[list[float]] = xyz[np.isfinite(xyz).all(axis=1), :2].round(3).tolist()
+        xy = path_array(path)[:, :2]
+        points: list[list[float]] = xy[np.isfinite(xy).all(axis=1)].round(3).tolist()
         return points
 
 

@@ -7,8 +7,7 @@ import demo_world
 import numpy as np
 from numpy.typing import NDArray
 
-from instant_ic.console.layer_meshes import page_layer
-from instant_ic.console.layers import PageLayers
+from instant_ic.console.layers import PageLayers, page_layer
 from instant_ic.geometry.poses import Matrix
 from instant_ic.geometry.projections import equirect_directions
 from instant_ic.vspace.background import Background

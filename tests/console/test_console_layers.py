@@ -11,11 +11,11 @@ from console_servers import WAIT_S, until
 
 from instant_ic.console import ConsoleClient, FrameKind, PageProtocolError
 from instant_ic.console import pages as pages_module
-from instant_ic.console.layer_meshes import LayerMeshes
-from instant_ic.console.layers import PageLayer, PageLayers
+from instant_ic.console.layers import LayerMeshes, PageLayer, PageLayers
 from instant_ic.console.protocol import Parts, decode_frame
 from instant_ic.console.session import PART_BYTES
 from instant_ic.geometry.poses import pose_matrix
+from instant_ic.vspace.layer_mesh import LayerMesh
 from instant_ic.vspace.layers import Content, DecodedLayer, Kind, Layer, Layers
 
 
@@ -24,14 +24,16 @@ def layer(image=b"JPEG", **values):
     fields = {
         "image": image,
         "confidence": b"",
+        "mesh": mesh((2, 4)),
         "gain": (1.0, 0.9, 1.1),
         "map_from_camera": pose_matrix(x=1.0, z=1.2, yaw=math.pi / 2),
-        "size": (2, 4),
-        "corners": np.array([[0, 0], [4, 0], [2, 2]], np.uint16),
-        "inverse_depth": np.array([0.5, 0.25, 0.0], np.float32),
-        "triangles": np.array([[0, 1, 2]], np.uint32),
     }
     return PageLayer(**(fields | values))
+
+
+def mesh(size):
+    corners, inverse_depth = np.array([[0, 0], [4, 0], [2, 2]], np.uint16), np.array([0.5, 0.25, 0.0], np.float32)
+    return LayerMesh(corners, inverse_depth, np.array([[0, 1, 2]], np.uint32), size)
 
 
 def layers(version, *each):
@@ -65,7 +67,7 @@ def test_a_layer_that_the_page_holds_is_not_sent_again():
     assert payload.endswith(b"second")
     assert b"first" not in payload
     assert layer(gain=(1.0, 1.0, 1.0)).digest == layer().digest  # gain and pose are always sent
-    assert layer(size=(2, 5)).digest != layer().digest
+    assert layer(mesh=mesh((2, 5))).digest != layer().digest
 
 
 @pytest.mark.parametrize(
@@ -235,7 +237,7 @@ def test_meshes_are_made_once_and_what_was_seen_comes_before_all_guesses(monkeyp
         depth, zeros = np.full((8, 16), 0.5, np.float32), np.zeros((8, 16), np.float32)
         return DecodedLayer(np.zeros((8, 16, 3), np.uint8), depth, marks, zeros, zeros > 0)
 
-    monkeypatch.setattr("instant_ic.console.layer_meshes.decode_layer", decoded)
+    monkeypatch.setattr("instant_ic.console.layers.decode_layer", decoded)
     meshes = LayerMeshes()
     first = meshes.layers(version_of(encoded(1), encoded(2, Kind.BEHIND), encoded(3)))
     assert [bool(one.confidence) for one in first] == [False, False, True]
@@ -246,7 +248,7 @@ def test_meshes_are_made_once_and_what_was_seen_comes_before_all_guesses(monkeyp
     assert again[1] is first[2]
     PageLayers(1, (0.0, 0.0, 1.2), again).check()
     # A guess in the quad right of and below (3, 5) has four pixels, each a square of its own at its rim.
-    columns, rows = again[1].corners.T
+    columns, rows = again[1].mesh.corners.T
     assert (columns.min(), columns.max(), rows.min(), rows.max()) == (5, 7, 3, 5)
     meshes.layers(version_of(encoded(4)))
     meshes.layers(version_of(encoded(1)))

@@ -33,6 +33,7 @@ from instant_ic.msg import (
     twist_message,
     twist_values,
 )
+from instant_ic.vspace.layer_mesh import LayerMesh
 from nodes.console import ConsoleNode
 
 START = 1_000_000_000
@@ -378,8 +379,8 @@ def test_layers_are_taken_while_a_page_can_render_them(setup):
 
 def test_layers_that_no_page_could_render_are_a_fault_of_the_console(setup):
     _, node, server = setup
-    mesh = np.zeros((3, 2), np.uint16), np.ones(3, np.float32), np.array([[0, 1, 2]], np.uint32)
-    good = PageLayer(b"JPEG", b"", (1.0, 1.0, 1.0), np.eye(4), (2, 4), *mesh)
+    mesh = LayerMesh(np.zeros((3, 2), np.uint16), np.ones(3, np.float32), np.array([[0, 1, 2]], np.uint32), (2, 4))
+    good = PageLayer(b"JPEG", b"", mesh, np.eye(4))
     version = PageLayers(1, (0.0, 0.0, 1.2), (good,))
     node.feed.take_layers(version)
     assert server.layers == [version]
@@ -406,16 +407,15 @@ def test_map_is_sent_when_changed_and_at_most_twice_a_second(setup):
 
 def test_plan_comes_in_the_maps_frame(setup):
     bus, _, server = setup
-    publish_tree(bus, x=10.0)
     now = bus.clock.now_ns()
     bus.publish("/ic/state", control(bus, ControlState.VIRTUAL), latched=True)
     bus.publish("/ic/trajectory", path_message([[0, 0, 0], [1, 0, 0]], "map", now))
-    bus.publish("/nav/path", path_message([[0, 0, 0], [0, 1, 0]], "odom", now))
+    bus.publish("/nav/path", path_message([[1, 0, 0], [1, 1, 0]], "map", now))
     bus.publish("/ic/subgoal", pose_stamped(pose_matrix(x=4, y=5, yaw=0.5), "map", now))
     bus.advance(0.21)
     plan = server.texts["plan"]
     assert plan["trajectory"] == [[0, 0], [1, 0]]
-    assert plan["path"] == [[10, 0], [10, 1]]
+    assert plan["path"] == [[1, 0], [1, 1]]
     assert plan["subgoal"] == pytest.approx([4, 5, 0.5], abs=1e-3)
     bus.publish("/ic/state", control(bus, ControlState.REAL), latched=True)
     bus.advance(0.4)

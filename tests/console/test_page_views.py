@@ -8,8 +8,7 @@ import pytest
 from console_pages import BROWSER_TEST
 from page_renderer import PageRenderer
 
-from instant_ic.console.layer_meshes import LayerMeshes
-from instant_ic.console.layers import PageLayers
+from instant_ic.console.layers import LayerMeshes, PageLayers
 from instant_ic.geometry.image_quality import psnr_db
 from instant_ic.geometry.poses import pose_matrix
 from instant_ic.vspace import VirtualSpace, VirtualSpaceConfig
@@ -48,7 +47,7 @@ def test_the_page_shows_what_the_cpu_renders(browser, keyframe, full):
 
 def test_the_rim_of_a_surface_is_straight():
     """A slab before a wall, seen from aside: its rim's vertices lie on one line, each row's on the next one's."""
-    from instant_ic.console.layer_meshes import EDGE_RATIO
+    from instant_ic.console.layers import EDGE_RATIO
     from instant_ic.geometry.projections import equirect_directions
     from instant_ic.vspace.layer_mesh import layer_mesh
     from instant_ic.vspace.prior import edge_quads
