@@ -1,4 +1,4 @@
-"""Messages as text: YAML-like with long arrays shortened for people, a line of JSON for programs."""
+"""Messages as text: YAML with long arrays shortened for people, a line of JSON for programs."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import json
 from typing import Any
 
 import numpy as np
+import yaml
 
 
 def field(message: Any, path: str) -> Any:
@@ -34,48 +35,38 @@ def _fields(message: Any) -> list[tuple[str, Any]]:
     return [(f.name, getattr(message, f.name)) for f in dataclasses.fields(message) if not f.name.startswith("__")]
 
 
-def describe(value: Any, most: int | None = 12, indent: str = "") -> str:
-    """Format a message, or a field of one, as indented lines.
+class _MessageDumper(getattr(yaml, "CSafeDumper", yaml.SafeDumper)):  # type: ignore[misc]
+    """Writes lists of plain values on one line."""
+
+    def represent_sequence(self, tag: str, sequence: Any, flow_style: bool | None = None) -> Any:
+        return super().represent_sequence(tag, sequence, not any(isinstance(entry, dict) for entry in sequence))
+
+
+def describe(value: Any, most: int | None = 12) -> str:
+    """Return a message, or a field of one, as YAML.
 
     Args:
         value: the message or field.
         most: shorten arrays above this many values, and strings above ten times as many characters; None: never.
-        indent: spaces before each line.
     """
+    style: dict[str, Any] = {"default_flow_style": False, "sort_keys": False, "allow_unicode": True, "width": 1 << 20}
+    text = str(yaml.dump(_shortened(value, most), Dumper=_MessageDumper, **style))
+    return text.removesuffix("...\n").rstrip("\n")
+
+
+def _shortened(value: Any, most: int | None) -> Any:
     if dataclasses.is_dataclass(value):
-        lines = []
-        for name, inner in _fields(value):
-            if dataclasses.is_dataclass(inner) or _is_nested(inner):
-                lines += [f"{indent}{name}:", describe(inner, most, indent + "  ")]
-            else:
-                lines.append(f"{indent}{name}: {describe(inner, most)}")
-        return "\n".join(lines)
-    if _is_nested(value):
-        return "\n".join(f"{indent}- {describe(entry, most, indent + '  ').lstrip()}" for entry in value)
+        return {name: _shortened(inner, most) for name, inner in _fields(value)}
     if isinstance(value, (np.ndarray, list)):
-        if most is None or len(value) <= most:
-            return f"{indent}[{', '.join(_scalar(entry, most) for entry in value)}]"
-        head = ", ".join(_scalar(entry, most) for entry in value[: max(1, most // 2)])
-        return f"{indent}[{head}, ... {len(value)} values]"
-    return indent + _scalar(value, most)
-
-
-def _is_nested(value: Any) -> bool:
-    return isinstance(value, list) and bool(value) and dataclasses.is_dataclass(value[0])
-
-
-def _scalar(value: Any, most: int | None) -> str:
-    if isinstance(value, np.generic):
-        value = value.item()
-    if isinstance(value, bool):
-        return "true" if value else "false"
+        whole = most is None or len(value) <= most
+        head = [_shortened(entry, most) for entry in (value if whole else value[: max(1, (most or 0) // 2)])]
+        return head if whole else [*head, f"... {len(value)} values"]
+    value = value.item() if isinstance(value, np.generic) else value
     if isinstance(value, float):
-        return f"{value:.9g}"
-    if not isinstance(value, str):
-        return str(value)
-    if most is None or len(value) <= 10 * most:
-        return repr(value)
-    return f"{value[: 10 * most]!r}... {len(value)} characters"
+        return float(f"{value:.9g}")
+    if most is not None and isinstance(value, str) and len(value) > 10 * most:
+        return f"{value[: 10 * most]}... {len(value)} characters"
+    return value
 
 
 def json_line(value: Any) -> str:
