@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import grp
 import importlib.util
 import os
@@ -14,6 +15,10 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+
+from instant_ic.config.params import ParameterError, load_file
+from instant_ic.util import paths
+from instant_ic.util.safe_text import direct, masked, visible
 
 OK, WARN, FAIL = "ok", "warn", "fail"
 MIN_CORES = 2
@@ -40,6 +45,37 @@ class Finding:
     subject: str
     text: str
     advice: str = ""
+
+
+def run(args: argparse.Namespace) -> int:
+    """Run the checks and print their findings."""
+    colours = {OK: "32", WARN: "33", FAIL: "31"} if sys.stdout.isatty() else {}
+    counts = {OK: 0, WARN: 0, FAIL: 0}
+    serial_port = Path(args.serial_port or _configured("crawler_base", "roboclaw.port", "/dev/ttyACM0"))
+    camera_url = args.camera_url or _configured("theta_camera", "url", "http://192.168.1.1")
+    lidar_port = args.lidar_port or _configured("vlp16_driver", "port", 2368)
+    missing = FAIL if args.robot else WARN
+    checks = run_checks(paths.run_dir(), serial_port, camera_url, lidar_port, args.listen, missing)
+    for finding in checks:
+        counts[finding.level] += 1
+        level = f"{finding.level:<4}"
+        if finding.level in colours:
+            level = f"\033[{colours[finding.level]}m{level}\033[0m"
+        text = visible(masked(f"{finding.subject}: {finding.text}"))
+        print(f"{level}  {text}", file=direct(sys.stdout), flush=True)
+        if finding.advice and finding.level != OK:
+            print(f"      → {finding.advice}", flush=True)
+    print(f"{counts[OK]} ok, {counts[WARN]} warnings, {counts[FAIL]} failures")
+    return 1 if counts[FAIL] else 0
+
+
+def _configured(node: str, key: str, default: Any) -> Any:
+    """Return a parameter of the shipped config/robot.yaml."""
+    try:
+        found = load_file(paths.shipped_file("config", "robot.yaml"), node).get(key)
+    except (ParameterError, FileNotFoundError):
+        return default  # check_configuration reports the fault in the file
+    return default if found is None else found.value
 
 
 def run_checks(
@@ -145,8 +181,6 @@ def check_models() -> Iterator[Finding]:
 
 
 def _shipped(folder: str, pattern: str) -> list[Path]:
-    from instant_ic.util import paths
-
     return sorted(paths.share_dir(folder).glob(pattern))
 
 

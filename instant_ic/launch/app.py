@@ -12,7 +12,7 @@ from pathlib import Path
 from instant_ic.bus import registry
 from instant_ic.launch.description import LaunchDescription
 from instant_ic.launch.health import HealthMonitor, TopicFault
-from instant_ic.launch.node_table import NodeRow, topic_rows
+from instant_ic.launch.node_table import NodeRow, heartbeat_row
 from instant_ic.launch.outlet import Outlet
 from instant_ic.launch.pacing import Pacing
 from instant_ic.launch.process import ManagedProcess, ProcessState
@@ -157,8 +157,9 @@ def node_row(process: ManagedProcess, monitor: HealthMonitor | None, faults: Seq
     health = monitor.nodes.get(label) if monitor is not None else None
     if health is None or health.seen_s < process.started_s:
         return NodeRow(label, "starting", restarts=restarts)
+    row = heartbeat_row(label, health, restarts)
     own = [fault for fault in faults if fault.label == label]
-    state = "silent" if health.silent else "slow" if health.state == "running" and own else health.state
-    text = health.message or ", ".join(f"{f.topic.lstrip('/')} {f.text}" for f in own if f.stopped)
-    lost, outputs = sum(health.lost.values()), topic_rows(health.outputs)
-    return NodeRow(label, state, text, health.cpu_percent, health.rss_mb, restarts, lost, outputs)
+    if row.state == "running" and own:
+        row.state = "slow"
+    row.message = row.message or ", ".join(f"{f.topic.lstrip('/')} {f.text}" for f in own if f.stopped)
+    return row

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from rich.table import Table
 from rich.text import Text
 
-from instant_ic.bus.heartbeat import EVERY_NODES, Flow
+from instant_ic.bus.heartbeat import EVERY_NODES, Flow, Heartbeat
 from instant_ic.launch.topics import expected_rate
 from instant_ic.util.safe_text import visible
 
@@ -71,6 +71,14 @@ class NodeRow:
     restarts: int = 0
     lost: int = 0
     outputs: list[TopicRow] = field(default_factory=list)
+
+
+def heartbeat_row(label: str, beat: Heartbeat, restarts: int = 0) -> NodeRow:
+    """Return a node's row by its newest heartbeat."""
+    state, lost = "silent" if beat.silent else beat.state, sum(beat.lost.values())
+    row = NodeRow(label, state, beat.message, beat.cpu_percent, beat.rss_mb, restarts, lost)
+    row.outputs = topic_rows(beat.outputs)
+    return row
 
 
 def topic_rows(flows: Mapping[str, Flow]) -> list[TopicRow]:
