@@ -48,13 +48,13 @@ def read_scan(message: LaserScan, mounts: TransformBuffer, base_frame: str) -> t
         mount = level_mount(mounts.lookup(base_frame, message.header.frame_id))
         return Scan(np.asarray(message.ranges), *angles, *limits, stamp_ns(message)), mount
     except TransformError as error:
-        raise ScanError(f"where the laser stands is not known yet: {error}") from None
+        raise ScanError(f"the laser's mount is not known yet: {error}") from None
     except ValueError as error:
         raise ScanError(f"the scan cannot be used: {error}") from None
 
 
 def integrity_message(slam: GridSlam, result: SlamResult, map_frame: str, stamp: int) -> Any:
-    """Return the PoseIntegrity after a scan, of which ``result`` is the result."""
+    """Return the PoseIntegrity after a scan with this result."""
     trust, found = result.integrity, slam.contradiction
     return PoseIntegrity(
         header=header(map_frame, stamp),

@@ -20,7 +20,7 @@ class CommandSource:
         driver: the obeyed node; with any source allowed, the last publisher.
         dropped: number of refused commands.
         publishers: whether another node also publishes commands.
-        command: what became of the newest command; None before the first.
+        command: diagnosis of the newest command; None before the first.
     """
 
     def __init__(self, config: CrawlerBaseConfig, on_stranger: Callable[[str], None]) -> None:

@@ -25,7 +25,7 @@ _RECONNECT_MIN_S, RECONNECT_MAX_S = 0.2, 2.0
 _SURE_WITHIN_S = 0.025
 """A reading that took longer may be as much older than its stamp: the process had to wait for the processor."""
 _UNSURE_AFTER_S = 0.2
-"""After this time without a surer reading it is taken all the same."""
+"""After this time without a surer reading, an unsure one is taken."""
 
 
 @dataclass(frozen=True)

@@ -25,9 +25,9 @@ SLOW_CYCLE_S = 0.06
 _MISSING_M, _MISSING_SIMULATED_M = 0.02, 0.04
 """Motion that the counts of a track at fault lack; a simulation may be late on a busy machine."""
 _MOST_SIMULATED_S = 0.05
-"""Time that a reading of a simulation stands for at most: it may have paused for the rest."""
+"""Longest time that counts between two readings of a simulation: it may have paused for the rest."""
 _CHANGING_S = 0.25
-"""More may lack, by this time at a change of the command: the power brakes a track before it turns it round."""
+"""Further motion may lack after a change of the command, by this time at the change: power first brakes a track."""
 _LAG_S, _RECENT_S = 0.1, 0.3
 """Time from a command to its motion, and time for which a change of the command counts."""
 _BLANKED_POWER = 0.2

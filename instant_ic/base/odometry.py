@@ -35,8 +35,8 @@ class OdometryEstimate:
         stamp_ns: time of measurement.
         pose: base_link in odom, (x, y, yaw), metres and radians, (3,).
         twist: (v_x, v_y, w) in base_link, m/s and rad/s, (3,).
-        pose_covariance: in the order x y z rx ry rz, in odom, (6, 6).
-        twist_covariance: in the same order, in base_link, (6, 6).
+        pose_covariance: covariance of x y z rx ry rz in odom, (6, 6).
+        twist_covariance: covariance in the same order, in base_link, (6, 6).
     """
 
     stamp_ns: int

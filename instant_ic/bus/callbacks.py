@@ -19,7 +19,7 @@ class Callbacks:
     """Callbacks of one node.
 
     Args:
-        diagnostics: where exceptions are reported.
+        diagnostics: reports the exceptions.
         wake: ends the node's wait for messages.
         lockstep: an exception is raised again after it has been reported.
 

@@ -63,7 +63,7 @@ class ControlServer:
 
     Args:
         node: the node.
-        path: of the socket; an existing file is replaced, since the caller holds the node's claim.
+        path: path of the socket; an existing file is replaced, since the caller holds the node's claim.
 
     Raises:
         RegistryError: the path is too long for a socket, or cannot be bound.

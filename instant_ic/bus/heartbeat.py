@@ -30,8 +30,8 @@ class Heartbeat:
     Attributes:
         state: one of ``STATES``.
         message: text of its worst diagnosis; empty when all is well.
-        cpu_percent: of one core.
-        inputs, outputs: by topic.
+        cpu_percent: load in percent of one core.
+        inputs, outputs: rate and age of each topic.
         lost: (topic, publisher) → messages that this node has lost.
         seen_s: monotonic time at which the heartbeat arrived.
     """

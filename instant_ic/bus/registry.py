@@ -339,7 +339,7 @@ class TopicFolder:
     """Live publishers of one topic, read again when its folder changes or a publisher's process has ended.
 
     Args:
-        folder: of the topic, see :func:`topic_dir`.
+        folder: folder of the topic, see :func:`topic_dir`.
 
     Attributes:
         publishers: those found at the last look.

@@ -250,7 +250,7 @@ class PeerProgress:
     """A subscription's page, on the side of one publisher.
 
     Args:
-        announcement: what the subscription announced.
+        announcement: ZeroMQ subscription that announces the page.
         publisher: 8 bytes that identify this publisher.
         joined: sequence of the newest message that was sent before it subscribed.
 

@@ -73,7 +73,7 @@ class ContradictionMonitor:
         self._restart()
 
     def _begin_step(self) -> None:
-        # Of wheels and LiDAR, (2, 3); rotation times LEVER_M.
+        # Steps of wheels and LiDAR, (2, 3); rotation times LEVER_M.
         self._step_m, self._step_s, self._step_judged = np.zeros((2, 3)), 0.0, np.ones(3, np.bool_)
 
     def _restart(self) -> None:

@@ -19,8 +19,8 @@ class ScanStep(NamedTuple):
     """Motion from the scan before to this one.
 
     Attributes:
-        motion: by scan matching, in the frame of the pose before, (3,).
-        wheels: the same by odometry; None unless both scans came with odometry.
+        motion: motion by scan matching, in the frame of the pose before, (3,).
+        wheels: the same motion by odometry; None unless both scans came with odometry.
         elapsed_s: time between the scans.
     """
 

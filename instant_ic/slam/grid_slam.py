@@ -172,7 +172,7 @@ class GridSlam:
             moved_m = math.hypot(step[0], step[1]) + 0.5 * abs(float(step[2]))
             self.monitor.matched(contradicted, score, elapsed_s, recovered, moved_m)
             if self._before is not None:
-                # What is older than the local map may contradict a right pose, which has drifted.
+                # Compare with the local map only: older parts may contradict a right pose, which has drifted.
                 before = self._before.map.contradiction(pose, points, LOCAL_KEYFRAMES)
                 self.monitor.compared(before - contradicted, moved_m)
             return not self.monitor.doubts
@@ -307,10 +307,11 @@ class GridSlam:
         if self._busy:
             return None
         job: Callable[[], FoundPlace | LoopOutcome] | None = None
-        if self._relocalization is not None and not self.localized:
+        lost_in, stamp_ns = self._relocalization, self.frames.stamp_ns
+        if lost_in is not None and not self.localized:
             recent = self.front_end.trajectory[-QUERY_KEYFRAMES:]
-            if self._points is not None and self.frames.stamp_ns is not None:
-                job = self._relocalization.search_job(recent, self.map_from_base, self._points, self.frames.stamp_ns)
+            if self._points is not None and stamp_ns is not None:
+                job = lost_in.saved.search_job(recent, self.map_from_base, self._points, stamp_ns, lost_in.reach_m)
         elif not self._broken and not self.front_end.in_known_map:
             new = self.front_end.trajectory[self._handed_over :]
             self._handed_over += len(new)
@@ -328,7 +329,7 @@ class GridSlam:
         """
         self._busy = False
         if self._job_of is not self.front_end.trajectory:
-            return  # of the session before
+            return  # the job belongs to the session before
         if outcome is None:
             self._broken = self.localized
         elif isinstance(outcome, LoopOutcome):

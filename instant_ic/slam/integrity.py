@@ -113,9 +113,9 @@ TUNING = IntegrityConfig()
 
 @njit(cache=True)
 def _compare_rays(cells, seen, since, origin, resolution, pose, laser, points):  # type: ignore[no-untyped-def]
-    """Count the rays that the map knows something about, that pass through a wall, and that end in free space.
+    """Count the rays with a known end or wall, those that pass through a wall, and those that end in free space.
 
-    Arguments as of `contradiction`; the laser's centre ``laser`` (2,) and the hits ``points`` (n, 2) are in the base
+    Arguments as in `contradiction`; the laser's centre ``laser`` (2,) and the hits ``points`` (n, 2) are in the base
     frame.
     """
     height, width = cells.shape
@@ -170,7 +170,7 @@ def contradiction(
         origin: (2,) corner of cell (0, 0).
         resolution: metres per cell.
         pose: map_from_base (3,).
-        scan: of the robot at that pose.
+        scan: scan taken at that pose.
         since: cells that only scans before this one have changed count as unknown.
     """
     points = scan.points
@@ -185,7 +185,7 @@ class Integrity:
     """Trust in a pose.
 
     Attributes:
-        lost_probability: 0..1, that the robot is somewhere else.
+        lost_probability: probability that the robot is somewhere else, 0..1.
         position_bound_m: protection level: the position error is below it with a probability of 99.9 %, if scan
             matching and drift err as their covariance says.
         heading_bound_rad: the same for the heading, at most π.
@@ -205,7 +205,7 @@ class IntegrityMonitor:
     """Probability of being lost, from scan to scan.
 
     Attributes:
-        contradiction: of the last scan.
+        contradiction: share of the last scan's rays that contradict the map, 0..1.
         after_gap: whether the doubt began with a time without matched scans.
         sign: whether the last scan is evidence, however weak, of another place.
     """
@@ -220,8 +220,8 @@ class IntegrityMonitor:
         self._period_s: float | None = None
         self._doubtful_scans = 0
         self._score_level: float | None = None
-        # Level, or value of the scan before, if worse: what changes gradually, as in a turn or in a map that has
-        # drifted, is no sign of another place.
+        # The level, or the value of the scan before if that is worse: a gradual change, as in a turn or in a map that
+        # has drifted, is no sign of another place.
         self._usual_score = self._usual_contradiction = 0.0
         self._contradiction_level = 0.0
 
@@ -243,14 +243,14 @@ class IntegrityMonitor:
     def matched(
         self, contradicted: float, score: float, elapsed_s: float, recovered: bool = False, moved_m: float = 0.0
     ) -> None:
-        """Take in a scan that fits somewhere.
+        """Weigh a scan that fits somewhere.
 
         Args:
             contradicted: share of its rays that contradict the map as it was before, 0..1; see `contradiction`.
-            score: of the match, 0..1.
-            elapsed_s: since the scan before.
+            score: score of the match, 0..1.
+            elapsed_s: seconds since the scan before.
             recovered: only the wide search has matched it.
-            moved_m: since the scan before; a radian counts as half a metre.
+            moved_m: metres driven since the scan before; a radian counts as half a metre.
         """
         self.contradiction = contradicted
         usual = score if self._score_level is None else self._usual_score
@@ -277,13 +277,13 @@ class IntegrityMonitor:
             self._usual_contradiction = max(self._contradiction_level, contradicted)
 
     def compared(self, excess: float, moved_m: float) -> None:
-        """Take in a scan that was compared with the map before a sign and with the map since.
+        """Weigh a scan that was compared with the map before a sign and with the map since.
 
         Scans of one place agree or disagree together, so evidence counts by the way driven.
 
         Args:
             excess: share of its rays that contradict the map before, less the share that contradicts the map since.
-            moved_m: since the scan before; a radian counts as half a metre.
+            moved_m: metres driven since the scan before; a radian counts as half a metre.
         """
         evidence = TUNING.per_m * (excess - TUNING.agrees) * min(moved_m, TUNING.longest_step_m)
         self._provisional_log_odds = _bounded(self._provisional_log_odds + evidence)
@@ -293,14 +293,14 @@ class IntegrityMonitor:
         self._provisional_log_odds = TUNING.floor
 
     def unmatched(self, fits_nowhere: bool, elapsed_s: float) -> None:
-        """Take in a scan without a match: one that fits nowhere near, or one without points."""
+        """Weigh a scan without a match: it fits nowhere near, or has no points."""
         self._note_gap(elapsed_s)
         if fits_nowhere:
             self._weigh(TUNING.evidence, elapsed_s)
         self._unseen(elapsed_s)
 
     def _note_gap(self, elapsed_s: float) -> None:
-        """Note before any doubt by the scan itself that a doubt begins with a time without matched scans."""
+        """Note whether a doubt begins with a time without matched scans; call before the scan raises a doubt itself."""
         self.after_gap = self.after_gap or (not self.doubts and self._unseen_s + elapsed_s > self._usual_s(elapsed_s))
 
     def _usual_s(self, elapsed_s: float) -> float:

@@ -25,10 +25,10 @@ class ScanKeyframe:
         map_from_base: (3,), changed by optimisation.
         scan: its points in the base frame.
         step: measured pose (3,) relative to the previous keyframe, at creation; zero for the first.
-        step_covariance: of ``step``, in the frame of the previous keyframe (3, 3).
+        step_covariance: covariance of ``step``, in the frame of the previous keyframe (3, 3).
         drift: covariance of the pose in the whole map (3, 3), map frame; grows with the distance since the last loop
             closure.
-        merged_into: for a removed keyframe, the keyframe that replaces it and this one's pose there (3,).
+        merged_into: keyframe that replaces this one and this one's pose there (3,); None unless it was removed.
     """
 
     stamp_ns: int
@@ -53,7 +53,7 @@ def grown_drift(drift: FloatArray, way: FloatArray, yaw: float, step_covariance:
     Args:
         drift: (3, 3).
         way: translation from the first pose to the second in the map, (2,).
-        yaw: of the first pose in the map.
+        yaw: heading of the first pose in the map.
         step_covariance: (3, 3) in the first pose's frame.
     """
     carry = np.eye(3)

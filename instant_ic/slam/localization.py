@@ -266,7 +266,7 @@ class FoundPlace:
     """Result of a search in the saved map.
 
     Attributes:
-        pose: of the scan that was searched for, in the frame of its own map (3,).
+        pose: pose of the scan that was searched for, in the frame of its own map (3,).
         found: its pose in the saved map; None if not found or not confirmed by a second scan yet.
         map: built from the saved keyframes if the map is to be extended; otherwise None.
     """

@@ -74,7 +74,7 @@ class LoopOutcome:
 
     Attributes:
         count: number of keyframes processed.
-        poses: of these keyframes (count, 3); None if unchanged.
+        poses: poses of these keyframes (count, 3); None if unchanged.
         alive: indices of the keyframes that have not been removed, ascending.
         drift: covariance of the last keyframe in the map (3, 3).
         map: rebuilt from all keyframes; None if it was not rebuilt.
@@ -127,7 +127,7 @@ class LoopClosure:
     """Loop closure and pose graph.
 
     Attributes:
-        edges: of the graph; node ids are positions in the list of keyframes.
+        edges: edges of the graph; node ids are positions in the list of keyframes.
         closed: number of accepted loops.
         refused: number of loops rejected after optimisation, because the rest of the graph contradicted them.
     """

@@ -43,10 +43,10 @@ class MapUpdates:
     def update(
         self, version: int, build: Callable[[], OccupancyGrid], now_ns: int
     ) -> tuple[MapPart | None, OccupancyGrid | None]:
-        """Return the changed part, if that suffices, and the whole map, if it is due; None for what not to publish.
+        """Return the changed part and the whole map, each None when it is not to be published now.
 
         Args:
-            version: of the map; ``build`` is called only if it has changed.
+            version: version of the map; ``build`` is called only if it has changed.
             build: returns the map.
             now_ns: steady time.
         """

@@ -52,7 +52,7 @@ def correlate(  # type: ignore[no-untyped-def]
         rotation_step: radians.
         guess: field_from_base (3,), the prior's mean.
         information: (3,) along, across, rotation; the prior's inverse variances.
-        cutoff: in σ.
+        cutoff: distance from the guess beyond which its cost hardly grows, in σ.
         gain: weight of the mean field value against the prior.
 
     Returns:
@@ -271,7 +271,7 @@ def match_scan(
 
     Args:
         field: the local map.
-        points: in the base frame.
+        points: points of the scan in the base frame, (n, 2).
         guess: field_from_base (3,).
         sigma: standard deviations (3,) of the guess: along, across, rotation.
         window: how far from the guess to search.

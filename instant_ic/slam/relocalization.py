@@ -9,7 +9,7 @@ it. A place far from where odometry says must therefore be found twice, from two
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -17,9 +17,9 @@ import numpy as np
 
 from instant_ic.geometry.poses import compose2, relative2
 from instant_ic.slam.keyframes import ScanKeyframe
-from instant_ic.slam.localization import FoundPlace, SavedMap
+from instant_ic.slam.localization import SavedMap
 from instant_ic.slam.occupancy import OccupancyMap
-from instant_ic.slam.scan import FloatArray, ScanPoints
+from instant_ic.slam.scan import FloatArray
 
 
 @dataclass(frozen=True)
@@ -50,13 +50,16 @@ class Relocalization:
     Args:
         saved: the map.
         by_odometry: whether odometry says where in the map the session began: it is the map of the session before.
+
+    Attributes:
+        reach_m: distance from odometry's place within which the robot is searched for, in metres.
     """
 
     def __init__(self, saved: SavedMap, by_odometry: bool = False) -> None:
         self.saved = saved
         self.by_odometry = by_odometry
         self.config = RelocalizationConfig()
-        self._reach_m = math.inf  # distance from odometry's place within which the robot is searched for
+        self.reach_m = math.inf
         self._found_before: tuple[FloatArray, FloatArray] | None = None
 
     @cached_property
@@ -64,16 +67,10 @@ class Relocalization:
         """The map as cells, to compare scans with."""
         return OccupancyMap.of_grid(self.saved.grid)
 
-    def search_job(
-        self, recent: Sequence[ScanKeyframe], pose: FloatArray, points: ScanPoints, stamp_ns: int
-    ) -> Callable[[], FoundPlace] | None:
-        """Return a job that searches the map for recent scans (`SavedMap.search_job`)."""
-        return self.saved.search_job(recent, pose, points, stamp_ns, self._reach_m)
-
     def lose(self, reach_m: float) -> None:
         """Note that the robot is lost in the map, by at most ``reach_m`` metres from where odometry says."""
         self.saved.located = False
-        self._reach_m = self.config.near_m + reach_m
+        self.reach_m = self.config.near_m + reach_m
         self._found_before = None
 
     def recognized(self, recent: Sequence[ScanKeyframe], moved: FloatArray, here: FloatArray) -> bool:

@@ -26,9 +26,9 @@ def diagnoses(slam: GridSlam, result: SlamResult, with_odometry: bool, use_wheel
 
     Args:
         slam: after `GridSlam.process`.
-        result: of that scan.
+        result: result of that scan.
         with_odometry: whether the scan came with odometry.
-        use_wheel_odom: whether it should have.
+        use_wheel_odom: whether scans should come with odometry.
     """
     sigma_m = float(np.sqrt(max(np.diag(result.covariance)[:2])))
     figures = {"score": round(result.score, 3), "sigma_xy_m": round(sigma_m, 4), **slam.figures()}
