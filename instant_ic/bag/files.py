@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import heapq
+import logging
 from collections import Counter
 from collections.abc import Callable, Collection, Generator, Iterator
 from contextlib import closing
@@ -23,6 +24,7 @@ from instant_ic.msg import deserialize
 from instant_ic.util.closing import Closing
 
 guard_rosbags()
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -82,6 +84,8 @@ class BagReader(Closing):
             if not (isinstance(connection.topic, str) and isinstance(connection.msgtype, str)):
                 self._reader.close()
                 raise BagError(f"bag {path} is damaged: topic {connection.topic!r} has the type {connection.msgtype!r}")
+        for file in self.unlisted:
+            log.warning("%s is not in metadata.yaml: its recording was cut short. Run ic bag recover %s", file, path)
 
     def close(self) -> None:
         if self._reader.is_open:

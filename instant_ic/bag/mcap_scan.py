@@ -19,9 +19,9 @@ from typing import Any
 from mcap import records
 from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
+from mcap.writer import MCAP0_MAGIC as MAGIC
 
 from instant_ic.bag.bounded import decompress
-from instant_ic.bag.mcap_writer import MAGIC
 from instant_ic.bag.message import BagError, Schema
 
 _MOST_DAMAGED = 1000

@@ -1,20 +1,18 @@
-"""Writes one MCAP file (https://mcap.dev/spec) by the `mcap` package; a full disk leaves a readable file.
+"""Writes one MCAP file (https://mcap.dev/spec) by the `mcap` package.
 
-The package's writer cannot go on after a failed write. Then the file is cut back to its last complete chunk and ended
-without an index.
+The package's writer cannot go on after a failed write. Then the file is cut back to its last complete chunk and closed:
+``ic bag recover`` reads it.
 """
 
 from __future__ import annotations
 
 import os
-import struct
 from collections import Counter
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from mcap.opcode import Opcode
-from mcap.writer import MCAP0_MAGIC as MAGIC
 from mcap.writer import CompressionType, Writer
 
 from instant_ic.bag.message import Topic
@@ -23,9 +21,6 @@ from instant_ic.util.private import open_file
 
 CHUNK_BYTES = 1 << 20
 """A chunk is closed once it is larger than this."""
-
-_END = struct.pack("<BQI", Opcode.DATA_END, 4, 0) + struct.pack("<BQQQI", Opcode.FOOTER, 20, 0, 0, 0) + MAGIC
-"""End of a file without an index, as the format allows."""
 
 Buffer = bytes | memoryview
 
@@ -50,14 +45,20 @@ class _File:
     def flush(self) -> None:
         """Do nothing: nothing is buffered."""
 
-    def cut_back(self, offset: int) -> None:
-        os.ftruncate(self.fd, offset)
-        os.lseek(self.fd, offset, os.SEEK_SET)
-        self.offset = offset
+    def close(self) -> None:
+        """Write the file to the disk itself and close it.
+
+        Raises:
+            OSError: the disk failed; the file is closed.
+        """
+        try:
+            os.fsync(self.fd)
+        finally:
+            os.close(self.fd)
 
 
 class McapWriter:
-    """One MCAP file of CDR messages; not thread-safe. After an error only :meth:`finish` may be called.
+    """One MCAP file of CDR messages; not thread-safe. After an error of a write it is closed.
 
     Args:
         path: the file, which must not exist; only its owner can read it.
@@ -85,7 +86,6 @@ class McapWriter:
         self._channels: dict[Topic, int] = {}
         self._file = _File(path)
         self._complete = 0  # end of the last complete chunk
-        self._failure: OSError | None = None
         self._open: list[tuple[Topic, int]] = []  # topic and stamp of each message in the open chunk
         self._open_bytes = 0
         compression = CompressionType.ZSTD if compressed else CompressionType.NONE
@@ -93,7 +93,6 @@ class McapWriter:
         try:
             self._put(self._writer.start, "ros2", "instant_ic")
         except OSError:
-            os.close(self._file.fd)
             path.unlink(missing_ok=True)
             raise
 
@@ -104,7 +103,7 @@ class McapWriter:
 
     @property
     def lost(self) -> Counter[str]:
-        """Messages by topic outside complete chunks; after :meth:`finish`, those that did not reach the disk."""
+        """Messages by topic that are in no complete chunk; once the file is closed, they are lost."""
         lost: Counter[str] = Counter()
         for (name, _), count in (self.given - self.counts).items():
             lost[name] += count
@@ -130,7 +129,7 @@ class McapWriter:
         """Append one message.
 
         Raises:
-            OSError: the disk is full; the file then ends with the last complete chunk.
+            OSError: the disk is full; the file ends with the last complete chunk.
         """
         self.given[topic] += 1
         if self.first_ns is None:
@@ -164,41 +163,28 @@ class McapWriter:
         Raises:
             OSError: the disk failed.
         """
-        os.fdatasync(self._file.fd)
+        self._put(os.fdatasync, self._file.fd)
 
-    def finish(self) -> OSError | None:
-        """Write index and footer, to the disk itself, and close the file.
-
-        Returns:
-            The error after which the file ends early and has no index; None if everything was written.
+    def finish(self) -> None:
+        """Write the open chunk, index and footer, to the disk itself, and close the file.
 
         Raises:
-            OSError: not even the end could be written; the file is closed and can be recovered.
+            OSError: the disk is full, or failed.
         """
-        try:
-            if self._failure is None:
-                try:
-                    self.flush()
-                    self._put(self._writer.finish)
-                except OSError as error:
-                    self._failure = error
-            if self._failure is not None:
-                self._file.write(_END)
-            os.fsync(self._file.fd)
-            return self._failure
-        finally:
-            os.close(self._file.fd)
+        self.flush()
+        self._put(self._writer.finish)
+        self._file.close()
 
     def _put(self, step: Callable[..., Any], *values: Any) -> Any:
-        """Call the package's writer; if it fails, cut the file back to the last complete chunk."""
-        if self._failure is not None:
-            raise self._failure
+        """Call the package's writer; if it fails, cut the file back to the last complete chunk and close it."""
         before = self._file.offset
         try:
             result = step(*values)
-        except OSError as error:
-            self._failure = error
-            self._file.cut_back(self._complete)
+        except OSError:
+            with suppress(OSError):
+                os.ftruncate(self._file.fd, self._complete)
+            with suppress(OSError):
+                self._file.close()
             raise
         if self._file.offset > before:
             self._complete = self._file.offset

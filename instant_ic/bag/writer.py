@@ -59,6 +59,7 @@ class BagWriter(Closing):
         self._custom: dict[str, str] = {}
         self._done: list[McapWriter] = []
         self._file: McapWriter | None = None
+        self._opened = 0  # files, also those that were given up
         self._closed = False
         try:
             make_folder(path)
@@ -117,7 +118,7 @@ class BagWriter(Closing):
         except BagError:
             self.lost = self.lost + Counter([topic])
             raise
-        with self._ending_after_errors(topic):
+        with self._giving_up(topic):
             file.write(key, stamp_ns, payload)
         self.bytes += len(payload)
 
@@ -134,7 +135,7 @@ class BagWriter(Closing):
         """
         self._add((topic, type_name), qos)
         if self._file is not None:
-            with self._ending_after_errors(topic):
+            with self._giving_up(topic):
                 self._file.add_topic((topic, type_name))
 
     def set_custom(self, key: str, value: str) -> None:
@@ -147,7 +148,7 @@ class BagWriter(Closing):
             BagError: the disk is full.
         """
         if self._file is not None and self._file.given:
-            with self._ending_after_errors("metadata"):
+            with self._giving_up("metadata"):
                 self._file.add_metadata(CUSTOM_RECORD, self._custom)
 
     def flush(self) -> None:
@@ -157,7 +158,7 @@ class BagWriter(Closing):
             BagError: the disk is full.
         """
         if self._file is not None:
-            with self._ending_after_errors("flush"):
+            with self._giving_up("flush"):
                 self._file.flush()
 
     def sync(self) -> None:
@@ -167,7 +168,7 @@ class BagWriter(Closing):
             BagError: the disk failed.
         """
         if self._file is not None:
-            with self._ending_after_errors("sync"):
+            with self._giving_up("sync"):
                 self._file.sync()
                 sync_folder(self.path)
 
@@ -175,29 +176,17 @@ class BagWriter(Closing):
         """Complete the current file and list it in ``metadata.yaml``; the next message starts another.
 
         Raises:
+            DiskFullError: the file did not fit; it is not listed, and can be recovered.
             BagError: the file cannot be completed.
         """
-        file, self._file = self._file, None
-        full: OSError | None = None
-        if file is not None:
-            try:
-                with suppress(OSError):  # no room; metadata.yaml holds the same values
-                    file.add_metadata(CUSTOM_RECORD, self._custom)
-                full = file.finish()
-            except OSError as error:
-                self.lost = self.lost + file.lost
-                raise BagError(
-                    f"bag {self.path} cannot be completed: {error.strerror}; try ic bag recover {self.path}"
-                ) from error
-            if not file.path.exists():
-                file.counts.clear()
-                self.lost = self.lost + file.lost
-                raise BagError(f"bag {self.path}: {file.path.name} was removed while it was being recorded")
-            self.lost = self.lost + file.lost
-            self._done.append(file)
+        try:
+            if self._file is not None:
+                self._finish_file(self._file)
+        except BagError:
+            with suppress(BagError):  # the first error says more
+                self._write_metadata()
+            raise
         self._write_metadata()
-        if full is not None:
-            raise self._full_or_failed(full, f"bag {self.path}")
 
     def close(self) -> None:
         """Write index and metadata. Idempotent.
@@ -228,8 +217,8 @@ class BagWriter(Closing):
         if self._file is None:
             self._file = self._open_file()
         file = self._file
-        if self._done and file.first_ns is None:
-            with self._ending_after_errors("latched values"):
+        if self._opened > 1 and file.first_ns is None:
+            with self._giving_up("latched values"):
                 for value in self._latched.values(but=latched):
                     file.write((value.topic, value.type_name), stamp_ns, value.payload)
         return file
@@ -243,7 +232,7 @@ class BagWriter(Closing):
         return 0 < self.max_duration_ns <= abs(stamp_ns - file.first_ns)
 
     def _open_file(self) -> McapWriter:
-        number = len(self._done)
+        number, self._opened = self._opened, self._opened + 1
         numbered = number > 0 or self.max_bytes > 0 or self.max_duration_ns > 0
         name = f"{self.path.name}_{number}.mcap" if numbered else f"{self.path.name}.mcap"
         try:
@@ -253,23 +242,33 @@ class BagWriter(Closing):
                 raise DiskFullError(f"bag {self.path}: {error.strerror}") from error
             raise BagError(f"bag {self.path} cannot be created: {error.strerror or error}") from None
 
+    def _finish_file(self, file: McapWriter) -> None:
+        with self._giving_up("end of the file"):
+            file.flush()
+            file.add_metadata(CUSTOM_RECORD, self._custom)
+            file.finish()
+        self._file = None
+        if not file.path.exists():
+            file.counts.clear()
+            self.lost = self.lost + file.lost
+            raise BagError(f"bag {self.path}: {file.path.name} was removed while it was being recorded")
+        self._done.append(file)
+
     @contextmanager
-    def _ending_after_errors(self, what: str) -> Iterator[None]:
-        """End the file at its last complete chunk after an error of the disk.
+    def _giving_up(self, what: str) -> Iterator[None]:
+        """After an error of the disk, count what the current file has lost, and leave it.
 
         Raises:
-            BagError: the disk failed.
+            BagError: the disk is full, or failed.
         """
         try:
             yield
         except OSError as error:
-            with suppress(DiskFullError):
-                self.end_file()
-            raise self._full_or_failed(error, f"bag {self.path}, {what}") from error
-
-    def _full_or_failed(self, error: OSError, words: str) -> BagError:
-        text = f"{words}: {error.strerror}; run ic bag recover {self.path}"
-        return DiskFullError(text) if error.errno in _FULL else BagError(text)
+            if self._file is not None:
+                self.lost = self.lost + self._file.lost
+            self._file = None
+            text = f"bag {self.path}, {what}: {error.strerror}; run ic bag recover {self.path}"
+            raise (DiskFullError if error.errno in _FULL else BagError)(text) from error
 
     def _write_metadata(self) -> None:
         try:

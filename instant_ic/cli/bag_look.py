@@ -57,10 +57,6 @@ def info(args: argparse.Namespace) -> int:
             print(f"{words}: {', '.join(f'{topic} {n}' for topic, n in sorted(summary[key].items()))}")
     if summary["recovered_from"]:
         print(f"recovered from {summary['recovered_from']}")
-    for name in summary["unlisted"]:
-        print(
-            f"{name} is in the folder but not in the index: its recording was cut short. Run ic bag recover {args.bag}"
-        )
     return 0
 
 

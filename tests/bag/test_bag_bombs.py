@@ -14,11 +14,11 @@ import pytest
 import yaml
 import zstandard
 from mcap.opcode import Opcode
+from mcap.writer import MCAP0_MAGIC as MAGIC
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 
 from instant_ic.bag import BagError, BagReader, bounded
 from instant_ic.bag.mcap_scan import McapScan
-from instant_ic.bag.mcap_writer import MAGIC
 from instant_ic.bag.recover import recover
 from instant_ic.msg import typestore
 

@@ -113,7 +113,9 @@ def test_clock_set_back_ends_a_file_and_reads_in_order(tmp_path: Path) -> None:
         assert (len(reader.files), reader.start_ns, reader.end_ns) == (3, 50 * S, 103 * S)
 
 
-def test_metadata_tells_complete_files_while_the_last_is_written(tmp_path: Path) -> None:
+def test_metadata_tells_complete_files_while_the_last_is_written(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     writer = BagWriter(tmp_path / "bag", max_duration_s=2.0)
     for index in range(5):
         writer.write("/scan", BOOL, bytes([index]), index * S, SENSOR)
@@ -122,6 +124,7 @@ def test_metadata_tells_complete_files_while_the_last_is_written(tmp_path: Path)
     with BagReader(tmp_path / "bag") as reader:
         assert [m.payload[0] for m in reader.messages()] == [0, 1, 2, 3]
         assert [file.name for file in reader.unlisted] == ["bag_2.mcap"]
+    assert "bag_2.mcap is not in metadata.yaml" in caplog.text and "ic bag recover" in caplog.text
     result = recover(tmp_path / "bag", tmp_path / "saved")
     assert (result.count, "bag_2.mcap" in result.stopped_by) == (5, True)
     assert [m[2][0] for m in read(tmp_path / "saved")] == [0, 1, 2, 3, 4]
