@@ -4,11 +4,13 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from instant_ic.geometry.transforms import TransformBuffer, TransformError
 from instant_ic.lidar.config import FlatScanConfig
 from instant_ic.lidar.head import TURN_CDEG, Sector
-from instant_ic.lidar.motion import PlanarMotion
+from instant_ic.lidar.motion import MotionError, PlanarMotion, base_motion
 from instant_ic.lidar.packets import BLOCKS, FIRINGS, LASERS, encode_data_packet
 from instant_ic.lidar.stream import PacketStream, Revolution
+from instant_ic.util.diagnosis import Diagnosis, Level
 from instant_ic.util.jit import leave_out_blas
 
 _MOTION_SAMPLES = 65
@@ -56,6 +58,26 @@ def flat_scan(
     heights, limits = (config.min_height, config.max_height), (config.range_min, config.range_max)
     _project(revolution.points, rotation, translation, shifts, per_sample, heights, limits, ranges)
     return ranges
+
+
+def compensated_scan(
+    revolution: Revolution, base_from_lidar: NDArray[np.float64], config: FlatScanConfig, tf: TransformBuffer
+) -> tuple[NDArray[np.float32], Diagnosis]:
+    """Return the flat scan of a revolution as `flat_scan`, and the diagnosis ``motion`` of its compensation.
+
+    Args:
+        revolution: decoded points.
+        base_from_lidar: mount of the sensor, (4, 4).
+        config: height interval and beams.
+        tf: holds ``odom`` to ``base_link``; without it the base is assumed to stand still.
+    """
+    try:
+        motion = base_motion(tf, revolution.stamp_ns, revolution.end_ns)
+        text = "no odometry: the base is assumed to stand still" if motion is None else "scan is motion-compensated"
+        return flat_scan(revolution, base_from_lidar, config, motion), Diagnosis("motion", Level.OK, text)
+    except (MotionError, TransformError) as error:
+        state = Diagnosis("motion", Level.WARN, f"scan is not motion-compensated: {error}")
+    return flat_scan(revolution, base_from_lidar, config, None), state
 
 
 def check_level(base_from_lidar: NDArray[np.float64]) -> None:

@@ -1,10 +1,17 @@
-"""Motion of the base during a revolution."""
+"""Motion of the base during a revolution, from the transform buffer."""
+
+from __future__ import annotations
 
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from instant_ic.geometry.poses import pose2_from_matrix
+from instant_ic.geometry.transforms import TransformBuffer, TransformError
+
+_SAMPLES = 13
+_LEAST_NS = 50_000_000
 _MAX_EXTRAPOLATION_S = 0.2
 """Largest extrapolation beyond the first and the last pose."""
 
@@ -18,18 +25,12 @@ class PlanarMotion:
     """Poses of the base over time, interpolated linearly and extrapolated with the velocity of the last poses.
 
     Attributes:
-        stamps_ns: stamps in rising order, (M,), M >= 1.
+        stamps_ns: stamps in rising order, (M,), M >= 2.
         odom_from_base: (x, y, yaw), metres and radians, (M, 3).
     """
 
     stamps_ns: NDArray[np.int64]
     odom_from_base: NDArray[np.float64]
-
-    def __post_init__(self) -> None:
-        if self.stamps_ns.ndim != 1 or self.odom_from_base.shape != (len(self.stamps_ns), 3):
-            raise MotionError(f"poses {self.odom_from_base.shape} do not match stamps {self.stamps_ns.shape}")
-        if len(self.stamps_ns) == 0 or (np.diff(self.stamps_ns) <= 0).any():
-            raise MotionError("stamps must increase, and at least one is required")
 
     def at(self, stamps_ns: ArrayLike) -> NDArray[np.float64]:
         """Return the poses at the given times, (..., 3); yaw is not wrapped.
@@ -44,8 +45,6 @@ class PlanarMotion:
             raise MotionError(
                 f"no pose of the base within {_MAX_EXTRAPOLATION_S} s (the nearest is {outside_s:.3f} s away)"
             )
-        if len(self.stamps_ns) == 1:
-            return np.broadcast_to(self.odom_from_base[0], (*wanted.shape, 3)).copy()
         poses = self.odom_from_base.copy()
         poses[:, 2] = np.unwrap(poses[:, 2])
         # Relative to the first stamp, because a float64 cannot hold nanoseconds since the epoch exactly.
@@ -60,7 +59,29 @@ class PlanarMotion:
         end = self.at(end_ns)
         relative = self.at(stamps_ns) - end
         c, s = np.cos(end[2]), np.sin(end[2])
-        x, y = relative[..., 0].copy(), relative[..., 1].copy()
-        relative[..., 0] = c * x + s * y
-        relative[..., 1] = -s * x + c * y
+        relative[..., :2] = relative[..., :2] @ np.array([[c, -s], [s, c]])
         return relative
+
+
+def base_pose(tf: TransformBuffer) -> NDArray[np.float64]:
+    """Return the newest pose of the base in ``odom``, (3,); the origin if it is unknown."""
+    try:
+        return pose2_from_matrix(tf.lookup("odom", "base_link"))
+    except TransformError:
+        return np.zeros(3)
+
+
+def base_motion(tf: TransformBuffer, start_ns: int, end_ns: int) -> PlanarMotion | None:
+    """Return the poses of the base around a revolution; None if they are not published.
+
+    Raises:
+        TransformError: the poses of this time are missing.
+    """
+    newest_ns = tf.newest_ns("base_link")
+    if newest_ns is None:
+        return None
+    # Odometry of the last milliseconds has not arrived yet: the motion is extrapolated.
+    stop_ns = min(end_ns, newest_ns)
+    stamps_ns = np.linspace(min(start_ns, stop_ns - _LEAST_NS), stop_ns, _SAMPLES).astype(np.int64)
+    poses = [pose2_from_matrix(tf.lookup("odom", "base_link", int(stamp))) for stamp in stamps_ns]
+    return PlanarMotion(stamps_ns, np.array(poses))

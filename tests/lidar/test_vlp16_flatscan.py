@@ -141,7 +141,3 @@ def test_motion_interpolates_goes_on_and_ends_somewhere() -> None:
     assert motion.at(START + SECOND // 5)[0] == pytest.approx(0.2)
     with pytest.raises(MotionError, match=r"no pose of the base within 0.2 s"):
         motion.at(START + SECOND)
-    with pytest.raises(MotionError, match="increase"):
-        PlanarMotion(np.array([2, 1]), np.zeros((2, 3)))
-    alone = PlanarMotion(np.array([START]), np.array([[1.0, 2.0, 0.5]]))
-    np.testing.assert_allclose(alone.at([START, START + 1000]), [[1.0, 2.0, 0.5]] * 2)
