@@ -105,8 +105,10 @@ class VirtualRobotNode(Node[VirtualRobotConfig]):
             self.robot.step(self.times.obeyed, robot_pose, dt_s, self.walls.found, float(state.vbot_limit_m_s))
         elif action == VbotAction.HELD:
             self.robot.step((0.0, 0.0), robot_pose, dt_s, self.walls.found)
-        else:
+        elif action == VbotAction.EASED:
             self.robot.ease(target, robot_twist, dt_s)
+        else:
+            self.robot.lead_back(robot_pose, dt_s, self.walls.found)
         slowed = f", slowed by {self.robot.slowed_by}" if self.robot.slowed_by else ""
         self.diagnose("state", OK, action.name.lower().replace("_", " ") + slowed)
 

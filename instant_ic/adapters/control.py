@@ -12,11 +12,10 @@ from numpy.typing import NDArray
 from instant_ic.bus import Latest
 from instant_ic.bus.clock import Clock
 from instant_ic.bus.transport import Received
-from instant_ic.control.arbiter import Decision
+from instant_ic.control.arbiter import STANDS_M_S, STANDS_RAD_S, Decision
 from instant_ic.control.command_gate import CommandGate, GateLimits
 from instant_ic.control.estop import KeptEstop
 from instant_ic.control.freshness import TimeoutConfig
-from instant_ic.control.guards import STANDS_M_S, STANDS_RAD_S
 from instant_ic.control.interruptions import WATCHED
 from instant_ic.control.kinematics import extrapolate
 from instant_ic.control.operator_view import OperatorView, PageReport

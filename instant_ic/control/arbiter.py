@@ -30,6 +30,8 @@ from instant_ic.geometry.poses import wrap_angle
 from instant_ic.util.diagnosis import Diagnosis, Level
 
 _PASSAGE_PERIOD_S = 0.2
+STANDS_M_S, STANDS_RAD_S = 0.03, 0.1
+"""Below this speed a robot counts as standing."""
 
 
 @dataclass(frozen=True)
@@ -59,7 +61,7 @@ class Decision:
     """The command as used: zero when stale."""
     vbot_action: VbotAction
     vbot_target: NDArray[np.float64]
-    """(3,) pose that the v-bot moves to: the r-bot as it will be shown."""
+    """(3,) pose that the v-bot moves to: the r-bot as it will be shown; for LED_BACK the r-bot itself."""
     vbot_limit_m_s: float
     """Speed limit of the v-bot that follows from the rate of the views, in m/s."""
     hard: bool = False
@@ -86,6 +88,7 @@ class Arbiter:
         self._agree_since_ns: int | None = None
         self._slow_since_ns: int | None = None  # the v-bot drives slower than commanded since then
         self._ready: tuple[Vspace, int] | None = None  # last ready state of the virtual space, and its time
+        self._leading_back = False
         self._no_view_fits = False  # the last entry was abandoned
         self._hard = False  # the last command was a hard stop
         self._yaw_gap_before = 0.0  # in the previous step
@@ -155,7 +158,7 @@ class Arbiter:
             estop=estop_pressed(snapshot),
             operator_command=snapshot.command,
             vbot_action=_vbot_action(snapshot),
-            vbot_target=snapshot.target.copy(),
+            vbot_target=np.array(inputs.robot_pose if snapshot.leading_back else snapshot.target),
             hard=self._hard,
             vbot_limit_m_s=self._sources.vbot_limit_m_s(inputs, self.mode),
         )
@@ -263,7 +266,13 @@ class Arbiter:
             vbot_jumped=self._vbot_jumps(vbot, now_ns),
         )
         self._no_view_fits = self._no_view_fits and not _may_enter_again(snapshot)
-        snapshot = replace(snapshot, no_view_fits=self._no_view_fits, subgoal=self._subgoal(snapshot))
+        self._leading_back = self._leads_back(snapshot)
+        snapshot = replace(
+            snapshot,
+            no_view_fits=self._no_view_fits,
+            leading_back=self._leading_back,
+            subgoal=self._subgoal(snapshot),
+        )
         return replace(snapshot, against_switch=self._against_switch(snapshot, now_ns))
 
     def _vbot_is_slow(self, inputs: ArbiterInputs) -> bool:
@@ -345,6 +354,16 @@ class Arbiter:
         config = self.config.subgoal
         return choose_subgoal(s.inputs.costmap, s.vbot_pose, s.prediction, forward, s.inputs.walls, config)
 
+    def _leads_back(self, s: Snapshot) -> bool:
+        """Return whether the v-bot returns to the r-bot by itself: nobody drives it, and the r-bot cannot reach it."""
+        after_s = self.config.switch.lead_back_after_s
+        if s.mode != Mode.VIRTUAL or s.inputs.robot_pose is None or after_s == 0.0 or s.idle_s < after_s:
+            return False
+        if self._leading_back or s.idle_s >= 3.0 * after_s:
+            return True
+        linear, angular = s.inputs.robot_velocity
+        return s.agree_s < 0.0 and abs(linear) < STANDS_M_S and abs(angular) < STANDS_RAD_S
+
     def _against_switch(self, s: Snapshot, now_ns: int) -> Notice | None:
         """Return the reason against a switch in REAL with an obstacle ahead; None without one."""
         if s.mode != Mode.REAL or not s.obstacle_ahead:
@@ -396,4 +415,4 @@ def _vbot_action(s: Snapshot) -> VbotAction:
         return VbotAction.WITH_ROBOT
     if s.settles or any(stale.source.key in ("view", "command") for stale in s.stale):
         return VbotAction.HELD  # the operator does not see it, or does not drive it
-    return VbotAction.DRIVEN
+    return VbotAction.LED_BACK if s.leading_back else VbotAction.DRIVEN

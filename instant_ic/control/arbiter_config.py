@@ -42,7 +42,7 @@ class SwitchConfig(Checked):
         min_real_s: seconds between a return, or an abandoned entry, and the next entry.
         return_margin_m: length in metres that must be free beyond the horizon that triggers an entry.
         neutral_return_s: seconds of hands off after which the real view returns even before an obstacle.
-        hand_back_after_s: seconds of hands off after which the operator drives an r-bot that cannot follow; 0: never.
+        lead_back_after_s: seconds of hands off after which the v-bot goes back to an r-bot that cannot come; 0: never.
         stop_margin_m: distance in metres kept to an obstacle when no switch is possible.
         min_expected_psnr_db: expected quality in dB that a view of the robot's place needs; 0: not checked.
         ready_hold_s: seconds for which a virtual space that learns its next keyframe counts as ready with the last one.
@@ -64,7 +64,7 @@ class SwitchConfig(Checked):
     min_real_s: Annotated[float, Plausible(0, 60)] = 1.0
     return_margin_m: Annotated[float, Plausible(0.05, 5)] = 0.5
     neutral_return_s: Annotated[float, Plausible(0, 600)] = 3.0
-    hand_back_after_s: Annotated[float, Plausible(0, 600)] = 6.0
+    lead_back_after_s: Annotated[float, Plausible(0, 600)] = 6.0
     stop_margin_m: Annotated[float, Plausible(0, 2)] = 0.15
     min_expected_psnr_db: Annotated[float, Plausible(0, 60)] = 12.0
     ready_hold_s: Annotated[float, Plausible(0, 60)] = 2.0

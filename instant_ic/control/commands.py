@@ -57,6 +57,9 @@ class CommandRules:
     def _virtual(self, s: Snapshot) -> DriveCommand:
         """Return the path follower's command; the operator drives the v-bot."""
         hard = not s.fresh
+        if s.leading_back:
+            text = "No command: the view goes back to the robot. Drive to continue."
+            return DriveCommand(NO_MOTION, Notice(Reason.LEADING_BACK, text), hard=hard)
         text = "You drive the virtual robot." + _far_from_keyframe(s)
         if s.subgoal is None:
             text += " The robot has no free place near it."
@@ -66,9 +69,9 @@ class CommandRules:
             wanted = NO_MOTION  # the follower has not sent its first command yet
         sent = self.monitored(self._paced(wanted, s), s.inputs)
         notice = Notice(Reason.DRIVE_VBOT, text)
-        left_s = self.config.switch.hand_back_after_s - s.idle_s
-        if s.agree_s < 0.0 and 0.0 < left_s < self.config.switch.hand_back_after_s - 1.0:
-            text = f"The robot cannot reach your place. Drive on, or you get its camera back in {left_s:.0f} s."
+        left_s = self.config.switch.lead_back_after_s - s.idle_s
+        if s.agree_s < 0.0 and 0.0 < left_s < self.config.switch.lead_back_after_s - 1.0:
+            text = f"The robot cannot reach your place. The view goes back to the robot in {left_s:.0f} s."
             notice = Notice(Reason.ROBOT_CANNOT_FOLLOW, text)
         elif sent.action != "free":
             notice = Notice(Reason.DRIVE_VBOT, text + _NEAR_OBSTACLE)

@@ -16,8 +16,6 @@ from instant_ic.control.states import GUARDS, Reason
 
 MIN_SWITCH_SPEED_M_S = 0.03
 """Forward speed below which the robot counts as turning."""
-STANDS_M_S, STANDS_RAD_S = 0.03, 0.1
-"""A robot counts as standing below both speeds."""
 RETURN_SIDE_M = 0.12
 """Width beside the footprint, on each side, that must be free for a return."""
 _SILENT_S = 1.0
@@ -105,16 +103,6 @@ def rejoined(s: Snapshot) -> bool:
     if s.gap_m > switch.return_near_m and s.agree_s < switch.return_patience_s:
         return False
     return not s.stale_in_real and hold(s) is None and way_free(s)
-
-
-def left_alone(s: Snapshot) -> bool:
-    """Return whether nobody drives the v-bot, and the r-bot cannot reach it; the camera must be usable."""
-    after_s = s.config.switch.hand_back_after_s
-    if after_s == 0.0 or s.idle_s < after_s or s.stale_in_real or hold(s) is not None:
-        return False
-    linear, angular = s.inputs.robot_velocity
-    stands = abs(linear) < STANDS_M_S and abs(angular) < STANDS_RAD_S
-    return (stands and s.agree_s < 0.0) or s.idle_s >= 3.0 * after_s
 
 
 def unsafe_again(s: Snapshot) -> bool:

@@ -172,6 +172,8 @@ class Snapshot:
     """The v-bot's pose has jumped: the r-bot would follow it to a place where nobody drove it."""
     no_view_fits: bool = False
     """An entry was abandoned, and neither has a view fitted since nor has the operator let go."""
+    leading_back: bool = False
+    """The v-bot returns to the r-bot by itself."""
     subgoal: Subgoal | None = None
     against_switch: Notice | None = None
     """Reason against a switch in REAL with an obstacle ahead; None if there is none."""

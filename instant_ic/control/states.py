@@ -36,6 +36,7 @@ class VbotAction(IntEnum):
     DRIVEN = 1
     HELD = 2
     EASED = 3
+    LED_BACK = 4
 
 
 class Reason(IntEnum):
@@ -47,6 +48,7 @@ class Reason(IntEnum):
     DRIVE_VBOT = 2
     SWITCHING_TO_VIRTUAL = 3
     SWITCHING_TO_CAMERA = 4
+    LEADING_BACK = 5
     ROBOT_CANNOT_FOLLOW = 6
     NO_SUBGOAL = 7
     # Blocked: an obstacle is ahead and no switch is possible
@@ -120,7 +122,6 @@ TRANSITIONS: tuple[Transition, ...] = (
     Transition(Mode.ENTERING, Mode.VIRTUAL, "view_fits", "place_vbot"),
     *_stops(Mode.VIRTUAL, "vspace_lost"),
     Transition(Mode.VIRTUAL, Mode.RETURNING, "rejoined", "ease_vbot"),
-    Transition(Mode.VIRTUAL, Mode.REAL, "left_alone", "hand_back"),
     *_stops(Mode.RETURNING, "vspace_lost"),
     Transition(Mode.RETURNING, Mode.VIRTUAL, "unsafe_again", "drive_vbot_on"),
     Transition(Mode.RETURNING, Mode.REAL, "image_fits", "hand_back"),
@@ -149,8 +150,6 @@ GUARDS: dict[str, str] = {
     "picture_yaw_deg, and an operator is there",
     "rejoined": "r-bot and v-bot agree for return_dwell_s, to within return_near_m or for return_patience_s; the "
     "command is safe for the r-bot over the prediction horizon and over a longer and wider one",
-    "left_alone": "hands off for hand_back_after_s, and the r-bot stands elsewhere than the v-bot; or hands off for "
-    "three times as long",
     "unsafe_again": "the command leads the r-bot into an obstacle again",
     "image_fits": "the v-bot is on the r-bot within return_picture_m and return_picture_yaw_deg, the r-bot turns no "
     "faster than return_turn_rad_s, and view and image agree as closely (after return_timeout_s the first is enough, "

@@ -15,10 +15,13 @@ from instant_ic.control.kinematics import MotionLimits, accelerate, move
 from instant_ic.control.walls import WallMap
 from instant_ic.geometry.poses import wrap_angle
 
+_TRACK_M = 0.1
 _WALL_CLEARANCE_M = 0.12
 """Between the v-bot's outline and a wall, so that the r-bot has room at the same place."""
 _EASE_TIME_S = 0.25
 """Time constant with which the last of an error vanishes."""
+_LEAD_BACK_M_S, _LEAD_BACK_RAD_S = 0.2, math.radians(20.0)
+"""Largest speed at which a v-bot that nobody drives goes back to the r-bot."""
 
 
 @dataclass(frozen=True)
@@ -59,12 +62,15 @@ class VirtualRobot:
         self.velocity: tuple[float, float] = (0.0, 0.0)
         self.slowed_by = ""
         """Why the last step was slower than commanded: ``lead``, ``wall`` or empty."""
+        self._led_m_s = 0.0
+        self._track: list[NDArray[np.float64]] = []  # driven places, ``_TRACK_M`` apart: the way back
 
     def place(self, pose: NDArray[np.float64], velocity: tuple[float, float]) -> None:
         """Place the v-bot at ``pose`` (x, y, yaw), moving at ``velocity`` (m/s, rad/s)."""
         self.pose = np.asarray(pose, dtype=np.float64).copy()
         self.velocity = self.limits.clip(*velocity)
         self.slowed_by = ""
+        self._track = []
 
     def step(
         self,
@@ -92,17 +98,29 @@ class VirtualRobot:
             self.velocity = (0.0, self.velocity[1])
             pose = move(self.pose, 0.0, self.velocity[1], dt_s)
         self.pose = pose
+        self._led_m_s = 0.0
+        if not self._track or _distance(pose, self._track[-1]) > _TRACK_M:
+            self._track.append(pose.copy())
 
     def ease(self, target: NDArray[np.float64], velocity: tuple[float, float], dt_s: float) -> None:
         """Move for ``dt_s`` at the r-bot's ``velocity`` (m/s, rad/s), easing the remaining error to ``target`` (3,)."""
+        config = self.config
         self.velocity = self.limits.clip(*velocity)
         moved = move(self.pose, *self.velocity, dt_s)
         share = min(1.0, dt_s / _EASE_TIME_S)
-        gap, turn = np.asarray(target)[:2] - moved[:2], share * wrap_angle(float(target[2] - moved[2]))
-        most_m, most_rad = self.config.ease_m_s * dt_s, math.radians(self.config.ease_deg_s) * dt_s
-        step = min(share, most_m / max(float(np.linalg.norm(gap)), 1e-9))
-        turn = max(-most_rad, min(most_rad, turn))
-        self.pose = np.array([*(moved[:2] + step * gap), wrap_angle(float(moved[2]) + turn)])
+        self.pose = _eased(moved, target, share, config.ease_m_s * dt_s, math.radians(config.ease_deg_s) * dt_s)
+        self.slowed_by = ""
+
+    def lead_back(self, robot_pose: NDArray[np.float64], dt_s: float, walls: WallMap | None = None) -> None:
+        """Go back towards the r-bot for ``dt_s``: straight, or along the driven track where a wall lies between."""
+        while self._track and _distance(self.pose, self._track[-1]) < _TRACK_M:
+            self._track.pop()
+        straight = not self._track or walls is None or _in_sight(self.pose, robot_pose, walls)
+        goal = np.asarray(robot_pose, dtype=np.float64) if straight else self._track[-1]
+        self._led_m_s = min(_LEAD_BACK_M_S, self._led_m_s + 0.25 * self.limits.max_linear_accel_m_s2 * dt_s)
+        share = min(1.0, dt_s / _EASE_TIME_S)
+        self.pose = _eased(self.pose, goal, share, self._led_m_s * dt_s, _LEAD_BACK_RAD_S * dt_s)
+        self.velocity = (0.0, 0.0)
         self.slowed_by = ""
 
     def lead_factor(self, linear: float, robot_pose: NDArray[np.float64]) -> float:
@@ -123,6 +141,27 @@ class VirtualRobot:
         now = float(walls.distance(_placed(self._body, self.pose)).min())
         then = float(walls.distance(_placed(self._body, pose)).min())
         return then < _WALL_CLEARANCE_M and then < now
+
+
+def _distance(a: NDArray[np.float64], b: NDArray[np.float64]) -> float:
+    return float(math.hypot(a[0] - b[0], a[1] - b[1]))
+
+
+def _eased(
+    pose: NDArray[np.float64], goal: NDArray[np.float64], share: float, most_m: float, most_rad: float
+) -> NDArray[np.float64]:
+    """Move ``pose`` (3,) towards ``goal`` by a share of the error, within the given limits."""
+    gap, turn = np.asarray(goal)[:2] - pose[:2], wrap_angle(float(goal[2] - pose[2]))
+    step = min(share, most_m / max(float(np.linalg.norm(gap)), 1e-9))
+    turn = max(-most_rad, min(most_rad, share * turn))
+    return np.array([*(pose[:2] + step * gap), wrap_angle(float(pose[2]) + turn)])
+
+
+def _in_sight(a: NDArray[np.float64], b: NDArray[np.float64], walls: WallMap) -> bool:
+    """Return whether no wall lies between two places."""
+    steps = np.linspace(0.0, 1.0, max(2, math.ceil(_distance(a, b) / walls.static.resolution)))
+    between = np.asarray(a)[:2] + steps[:, None] * (np.asarray(b)[:2] - np.asarray(a)[:2])
+    return bool((walls.distance(between) > walls.static.resolution).all())
 
 
 def _placed(body: NDArray[np.float64], pose: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -281,6 +281,8 @@ class Loop:
             self.vbot.place(self.shown_pose(robot), twist)
         elif said.vbot_action == VbotAction.EASED:
             self.vbot.ease(self.shown_pose(robot), twist, self.dt)
+        elif said.vbot_action == VbotAction.LED_BACK:
+            self.vbot.lead_back(robot, self.dt, self.walls)
         else:
             free = said.vbot_action == VbotAction.DRIVEN and self.ages["command"] <= 0.3
             self.vbot.step(operator if free else (0.0, 0.0), robot, self.dt, self.walls)

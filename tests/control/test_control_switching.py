@@ -71,6 +71,8 @@ class Drive:
             self.vbot.place(robot, self.speed)
         elif said.vbot_action == VbotAction.EASED:
             self.vbot.ease(robot, self.speed, DT)
+        elif said.vbot_action == VbotAction.LED_BACK:
+            self.vbot.lead_back(robot, DT)
         else:
             self.vbot.step(command if said.vbot_action == VbotAction.DRIVEN else NOTHING, robot, DT)
         inputs = ArbiterInputs(
@@ -90,7 +92,7 @@ class Drive:
         self.obey = decision = self.arbiter.step(inputs, round(len(self.steps) * DT * 1e9))
         if decision.mode == Mode.VIRTUAL:
             gap = self.vbot.pose - robot
-            self.robot = robot + np.clip(gap, -0.03, 0.03)
+            self.robot = robot + np.clip(gap, -0.03, 0.03) if decision.vbot_action != VbotAction.LED_BACK else robot
             self.speed = NOTHING
         else:
             self.speed = decision.command
@@ -349,25 +351,51 @@ def test_without_views_in_the_virtual_space_both_robots_stand() -> None:
     assert made.step(FORWARD).mode == Mode.STOPPED
 
 
-def test_hands_off_where_the_robot_cannot_follow_gives_its_camera_back_after_a_notice() -> None:
+def test_a_vbot_left_inside_an_obstacle_is_led_back_gently_and_told_and_a_command_ends_it() -> None:
     walls = corridor()
     made = Loop(World(np.concatenate([walls, rectangle(2.5, -0.25, 3.0, 0.25)])), draw_map(walls, (-2, -1.2, 14, 1.2)))
     made.start()
     while made.vbot.pose[0] < 2.6:
         made.step(FORWARD)
-    for _ in range(2):  # a command begins the wait anew
-        while "camera back in 2 s" not in made.step(NOTHING).decision.reason:
-            assert len(made.frames) < 600
-        made.step(FORWARD)
-    waits = made.base.pose.copy()
-    while made.step(NOTHING).decision.mode == Mode.VIRTUAL:
-        assert len(made.frames) < 1000
-    last = made.frames[-1]
-    assert last.decision.mode == Mode.REAL and last.command == NOTHING
-    assert last.t - max(f.t for f in made.frames if f.decision.operator_command != NOTHING) >= 5.95
+    while "The view goes back to the robot in 2 s" not in made.step(NOTHING).decision.reason:
+        assert len(made.frames) < 600
+    while made.frames[-1].decision.vbot_action != VbotAction.LED_BACK:
+        made.step(NOTHING)
+    assert made.frames[-1].t - max(f.t for f in made.frames if f.decision.operator_command != NOTHING) >= 5.95
+    start, waits = made.vbot.pose.copy(), made.base.pose.copy()
+    for _ in range(10):
+        frame = made.step(NOTHING)
+        assert frame.command == NOTHING
+        assert "the view goes back to the robot. Drive to continue" in frame.decision.reason
+    assert 0.02 < np.linalg.norm(made.vbot.pose[:2] - start[:2]) <= 0.1
+    assert made.step(FORWARD).decision.vbot_action == VbotAction.DRIVEN
+    while made.decision.mode.shows_vbot:
+        before = made.vbot.pose[:2].copy()
+        made.step(NOTHING)
+        assert np.linalg.norm(made.vbot.pose[:2] - before) <= (0.4 + 0.12) * DT
+        assert len(made.frames) < 1600
     np.testing.assert_allclose(made.base.pose[:2], waits[:2], atol=1.0)
-    made.step(FORWARD)
-    assert made.step(FORWARD).command == FORWARD
+    assert made.decision.mode == Mode.REAL
+
+
+def test_the_way_back_does_not_lead_through_a_wall() -> None:
+    from instant_ic.control.walls import WallMap
+
+    wall = np.array([[[0.5, -3.0], [0.5, 1.0]]])
+    walls = WallMap(draw_map(wall, (-4.0, -4.0, 4.0, 4.0)))
+    vbot = VirtualRobot(VbotConfig(), Arbiter().config.limits)
+    vbot.place(np.array([-0.5, 0.0, math.pi / 2]), NOTHING)
+    for yaw, metres in ((math.pi / 2, 2.0), (0.0, 2.0), (-math.pi / 2, 1.5)):  # round the wall's end
+        while abs(vbot.pose[2] - yaw) > 0.05 or abs(vbot.velocity[1]) > 0.01:
+            vbot.step((0.0, float(np.clip(2.0 * (yaw - vbot.pose[2]), -1.0, 1.0))), vbot.pose, DT)
+        for _ in range(round(metres / 0.4 / DT)):
+            vbot.step(FORWARD, vbot.pose, DT)
+    assert vbot.pose[0] > 1.0 and vbot.pose[1] < 0.9  # behind it
+    robot = np.array([-0.5, 0.0, 0.0])
+    for _ in range(round(60 / DT)):
+        vbot.lead_back(robot, DT, walls)
+        assert walls.distance(vbot.pose[:2]) > 0.04
+    np.testing.assert_allclose(vbot.pose, robot, atol=0.01)
 
 
 def test_a_source_is_late_by_its_own_rhythm() -> None:
