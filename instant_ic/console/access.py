@@ -10,7 +10,7 @@ import hmac
 import math
 import secrets
 import ssl
-from collections import OrderedDict, deque
+from collections import OrderedDict
 from dataclasses import dataclass
 from enum import Enum
 from pathlib import Path
@@ -18,15 +18,12 @@ from typing import Annotated
 
 from instant_ic.config.ranges import Positive, Range, check_ranges
 from instant_ic.util.private import read_secret
-from instant_ic.util.web_access import SIGN_IN, AccessError, is_loopback, sign_in_needed
+from instant_ic.util.web_access import SIGN_IN, AccessError, AddressBuckets, is_loopback, sign_in_needed
 
 COOKIE = "instant_ic_session"
 MIN_TOKEN = 16
-FIRST_WAIT_S = 0.25  # before a wrong token is answered, once its address has sent too many of them
-MAX_WAIT_S = 4.0
+MAX_WAIT_S = 4.0  # before a wrong token is answered, once its address has sent too many of them
 _MOST_SESSIONS = 256  # of one role
-_MOST_ADDRESSES = 1024
-_MOST_DOUBLINGS = 8
 
 
 class Role(Enum):
@@ -48,8 +45,8 @@ class AccessConfig:
             shows it on the terminal and in a file readable by its owner only, never in the log.
         watch_token_file: file with the token to watch and stop the robot only; empty: there is no such token.
         session_hours: lifetime of a sign-in.
-        tries_per_minute: wrong tokens of one address that are answered at once. Each further one doubles the wait for
-            the answer, up to ``MAX_WAIT_S``. A right token never waits.
+        tries_per_minute: wrong tokens of one address that are answered at once. The answer to each further one comes
+            after ``MAX_WAIT_S``. A right token never waits.
         tls_certificate: PEM file of the certificate; empty for plain HTTP.
         tls_key: PEM file of its key.
     """
@@ -134,7 +131,7 @@ class Access:
         self.made_token = ""
         self._digests: dict[Role, bytes] = {}
         self._sessions: OrderedDict[bytes, tuple[Role, float]] = OrderedDict()
-        self._failures: OrderedDict[str, deque[float]] = OrderedDict()
+        self._tries = AddressBuckets(config.tries_per_minute / 60.0, config.tries_per_minute)
         if not self.required:
             return
         drive = read_token(config.token_file) if config.token_file else secrets.token_urlsafe(24)
@@ -164,14 +161,7 @@ class Access:
 
         Only wrong tokens wait: an emergency stop must not queue behind a guesser who shares its address.
         """
-        failures = self._failures.setdefault(address, deque(maxlen=self.config.tries_per_minute + _MOST_DOUBLINGS))
-        self._failures.move_to_end(address)
-        recent = sum(now_s - at < 60.0 for at in failures)
-        failures.append(now_s)
-        while len(self._failures) > _MOST_ADDRESSES:
-            self._failures.popitem(last=False)
-        too_many = recent - self.config.tries_per_minute
-        return min(MAX_WAIT_S, FIRST_WAIT_S * 2.0**too_many) if too_many >= 0 else 0.0
+        return 0.0 if self._tries.of(address).take(now_s) else MAX_WAIT_S
 
     def open_session(self, role: Role, now_s: float) -> str:
         """Open a session and return the value of its cookie; of too many of one role, the oldest ends."""

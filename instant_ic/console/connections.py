@@ -1,4 +1,4 @@
-"""Limits on the number, rate and duration of connections to the operator's page.
+"""Limits on what clients of the operator's page can cost: connections in number, rate and duration, and log messages.
 
 The module depends on the HTTP server, not on the page. Times are seconds of the monotonic clock.
 """
@@ -6,17 +6,17 @@ The module depends on the HTTP server, not on the page. Times are seconds of the
 from __future__ import annotations
 
 import asyncio
-import ipaddress
 import logging
+import math
 import socket
 import ssl
 import time
-from collections import Counter, OrderedDict
+from collections import Counter
 from collections.abc import Callable, Iterable
 
 from aiohttp import web
 
-from instant_ic.util.web_access import TokenBucket
+from instant_ic.util.web_access import AddressBuckets, TokenBucket, network_of
 
 HEADERS_S = 5.0  # time for a TLS handshake, for a request's headers, and for its body
 STALL_S = 30.0  # a client that takes no data for this time is disconnected
@@ -30,38 +30,10 @@ HANDSHAKES_PER_S = 400.0  # TLS, of one address; each costs about 1 ms of the th
 BURST_HANDSHAKES = 128.0
 MOST_NEWCOMERS = 256  # connections whose first request has not arrived
 MOST_HEADERS = 32 * 1024  # bytes of a request line with its headers; browsers send cookies of all ports of a host
-_MOST_ADDRESSES = 1024
 _TOO_MANY = b"HTTP/1.1 429 Too Many Requests\r\nRetry-After: 1\r\nContent-Length: 0\r\nConnection: close\r\n\r\n"
+NOISY = ("instant_ic.console", "asyncio", "aiohttp.server", "aiohttp.web", "aiohttp.websocket", "aiohttp.internal")
+LOG_PERIOD_S = 1.0
 logger = logging.getLogger("instant_ic.console")
-
-
-class AddressBuckets:
-    """Token bucket for each address; the least recently used address is dropped first."""
-
-    def __init__(self, rate: float, burst: float) -> None:
-        self._rate, self._burst = rate, burst
-        self._buckets: OrderedDict[str, TokenBucket] = OrderedDict()
-
-    def of(self, address: str) -> TokenBucket:
-        """Return the bucket of an address."""
-        bucket = self._buckets.setdefault(address, TokenBucket(self._rate, self._burst))
-        self._buckets.move_to_end(address)
-        while len(self._buckets) > _MOST_ADDRESSES:
-            self._buckets.popitem(last=False)
-        return bucket
-
-
-def network_of(host: str) -> str:
-    """Return the key by which an address is limited: IPv4 in full, IPv6 by its /64, which belongs to one subscriber."""
-    try:
-        address = ipaddress.ip_address(host.partition("%")[0])
-    except ValueError:
-        return host
-    if isinstance(address, ipaddress.IPv6Address):
-        if address.ipv4_mapped is not None:
-            return str(address.ipv4_mapped)
-        return str(ipaddress.IPv6Network((int(address) >> 64 << 64, 64)))
-    return str(address)
 
 
 class LimitedConnection(asyncio.Protocol):
@@ -319,3 +291,37 @@ class Listener:
 def _report_end(task: asyncio.Task[None]) -> None:
     if not task.cancelled() and task.exception() is not None:
         logger.critical("no more connections are accepted: %r; restart the console", task.exception())
+
+
+class LogRate(logging.Filter):
+    """Passes one record of each place in the code every ``LOG_PERIOD_S``; the next one states how many were dropped.
+
+    Args:
+        clock: monotonic time in seconds; tests pass their own.
+    """
+
+    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
+        super().__init__()
+        self._clock = clock
+        self._last: dict[tuple[str, int], float] = {}
+        self._left_out: dict[tuple[str, int], int] = {}
+
+    def filter(self, record: logging.LogRecord) -> bool:
+        """Return whether the record is logged."""
+        place, now = (record.pathname, record.lineno), self._clock()
+        if now - self._last.get(place, -math.inf) < LOG_PERIOD_S:
+            self._left_out[place] = self._left_out.get(place, 0) + 1
+            return False
+        self._last[place] = now
+        if left_out := self._left_out.pop(place, 0):
+            record.msg, record.args = f"{record.getMessage()} ({left_out} similar messages dropped)", ()
+        return True
+
+
+_FILTER = LogRate()
+
+
+def limit_logs() -> None:
+    """Limit the loggers of the console, asyncio and aiohttp's server. Further calls change nothing."""
+    for name in NOISY:
+        logging.getLogger(name).addFilter(_FILTER)

@@ -25,7 +25,6 @@ from instant_ic.util.pace import current
 from instant_ic.util.web_access import TokenBucket
 
 MAX_CLIENT_MESSAGE = 4096  # bytes
-MAX_BAD_MESSAGES = 20
 BURST_S = 2.0  # seconds' worth of messages that may arrive at once, after a radio link has stalled
 FIRST_S = 0.25  # the same for a new page
 WATCHER_SHARE = 0.4  # share of max_messages_per_s for a page that does not drive
@@ -278,12 +277,8 @@ class Pages:
             if not only_a_stop or message["type"] == "estop":
                 self.handle(session, message, now)
         except PageProtocolError as error:
-            session.bad_messages += 1
             logger.warning("client %d: %s", session.number, error)
-            if session.bad_messages >= MAX_BAD_MESSAGES:
-                self._end(session, WSCloseCode.POLICY_VIOLATION, "bad messages")
-            else:
-                session.reply({"type": "error", "text": str(error)})
+            session.reply({"type": "error", "text": str(error)})
 
     def handle(self, session: PageSession, message: dict[str, Any], now: float) -> None:
         """Handle a page's message at a steady time; raise PageProtocolError if it is wrong."""

@@ -25,13 +25,12 @@ from aiohttp import web
 from instant_ic.console.access import COOKIE, Access, AccessError, Role, tls_context
 from instant_ic.console.backend import ConsoleBackend, PageServer
 from instant_ic.console.config import ConsoleServerConfig
-from instant_ic.console.connections import CLOSE_S, HEADERS_S, AddressBuckets, Listener, network_of
+from instant_ic.console.connections import CLOSE_S, HEADERS_S, Listener, limit_logs
 from instant_ic.console.drive import DriveService
 from instant_ic.console.layers import PageLayers
-from instant_ic.console.log_rate import limit_logs
 from instant_ic.console.pages import Pages, now_ms
 from instant_ic.console.protocol import FrameKind, PendingFrame
-from instant_ic.util.web_access import host_allowed, is_loopback
+from instant_ic.util.web_access import AddressBuckets, host_allowed, is_loopback, network_of
 
 STATIC = Path(__file__).parent / "static"
 MAX_BODY = 4096  # bytes

@@ -48,7 +48,6 @@ class PageSession:
         """Cookie of the sign-in; the session ends with it. Empty without a sign-in, or for one by token."""
         self.closing: asyncio.Task[None] | None = None
         """Closing handshake, once the session has ended."""
-        self.bad_messages = 0
         self.chokes = False
         """True if too many replies are pending, which means that the client does not read."""
         self.away = False

@@ -7,12 +7,14 @@ import logging
 import math
 import os
 import sys
+from collections import OrderedDict
 from collections.abc import Sequence
 from pathlib import Path
 from urllib.parse import urlsplit
 
 from instant_ic.util.safe_text import direct
 
+_MOST_ADDRESSES = 1024
 SIGN_IN = ("auto", "always", "never")
 logger = logging.getLogger(__name__)
 
@@ -121,6 +123,33 @@ class TokenBucket:
     def wait_s(self) -> float:
         """Return the seconds from the last :meth:`take` until one token is available."""
         return max(0.0, 1.0 - self._tokens) / self.rate
+
+
+class AddressBuckets:
+    """Token bucket for each address; the least recently used address is dropped first."""
+
+    def __init__(self, rate: float, burst: float) -> None:
+        self._rate, self._burst = rate, burst
+        self._buckets: OrderedDict[str, TokenBucket] = OrderedDict()
+
+    def of(self, address: str) -> TokenBucket:
+        """Return the bucket of an address."""
+        bucket = self._buckets.setdefault(address, TokenBucket(self._rate, self._burst))
+        self._buckets.move_to_end(address)
+        while len(self._buckets) > _MOST_ADDRESSES:
+            self._buckets.popitem(last=False)
+        return bucket
+
+
+def network_of(host: str) -> str:
+    """Return the key by which an address is limited: IPv4 in full, IPv6 by its /64, which belongs to one subscriber."""
+    try:
+        address = ipaddress.ip_address(host.partition("%")[0])
+    except ValueError:
+        return host
+    if isinstance(address, ipaddress.IPv4Address):
+        return str(address)
+    return str(address.ipv4_mapped or ipaddress.IPv6Network((int(address) >> 64 << 64, 64)))
 
 
 def _hostname(url: str) -> str | None:
