@@ -16,7 +16,6 @@ import secrets
 import threading
 from collections import deque
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
@@ -26,17 +25,16 @@ from aiohttp import WSMsgType, web
 from instant_ic.bag.choice import TopicChoice
 from instant_ic.bag.metadata import schema_or_unknown
 from instant_ic.bridge import foxglove_protocol as protocol
-from instant_ic.bus import ERROR, Node, ParameterError, Subscription, registry
-from instant_ic.bus.control import ControlError, NodeControl
+from instant_ic.bus import ERROR, Node, Subscription, registry
 from instant_ic.bus.qos import PRESETS, RELIABLE
 from instant_ic.bus.registry import TopicInfo
 from instant_ic.bus.transport import Received
+from instant_ic.config.params import flatten
 from instant_ic.config.ranges import Range, check_ranges
 from instant_ic.util.web_access import SIGN_IN, refusal, sign_in_needed
 
 _END_S = 2.0
 _HEARTBEAT_S = 30.0
-_PARAMETERS_S = 1.0  # to wait for a node's answer
 _BACKLOG = 32
 _MAX_CLIENT_FRAME = 64 * 1024
 _MAX_BACKLOG_BYTES = 32 << 20
@@ -84,33 +82,14 @@ class FoxgloveBridgeConfig:
             raise ValueError(f"sign_in must be one of {', '.join(SIGN_IN)} (got {self.sign_in!r})")
 
 
-def read_parameters(run_dir: Path, names: Sequence[str]) -> tuple[dict[str, Any], list[str]]:
-    """Ask the running nodes for their parameters; this takes up to a second.
-
-    Args:
-        run_dir: run directory of the nodes.
-        names: parameters as ``/node.group.key``; empty reads all parameters of all nodes.
-
-    Returns:
-        Values by name, and a text for each node that did not answer or does not run.
-    """
-    running = {node.name for node in registry.list_nodes(run_dir)}
-    nodes = {name.strip("/").partition(".")[0] for name in names} if names else running
-
-    def ask(node: str) -> tuple[dict[str, Any], str]:
-        try:
-            found = NodeControl(run_dir, node, _PARAMETERS_S).get()
-        except (ControlError, ParameterError) as error:
-            return {}, str(error)
-        return {f"/{node}.{key}": value for key, value in found.items()}, ""
-
-    values: dict[str, Any] = {}
-    problems = [f"node {node!r:.100} does not run" for node in sorted(nodes - running)]
-    with ThreadPoolExecutor(8, thread_name_prefix="parameters") as pool:
-        for found, problem in pool.map(ask, sorted(nodes & running)):
-            values |= found
-            problems += [problem] if problem else []
-    return {name: value for name, value in values.items() if not names or name in names}, problems
+def read_parameters(run_dir: Path, names: Sequence[str]) -> dict[str, Any]:
+    """Return the parameters of the running nodes as ``/node.group.key``; all if ``names`` is empty."""
+    values = {
+        f"/{node.name}.{key}": value
+        for node in registry.list_nodes(run_dir)
+        for key, value in flatten(node.params).items()
+    }
+    return {name: values[name] for name in names if name in values} if names else values
 
 
 class _Viewer:
@@ -468,9 +447,8 @@ class FoxgloveServer:
                         viewer.unsubscribe(number)
                 self.wake.set()
             case "getParameters":
-                values, problems = await asyncio.to_thread(read_parameters, self._run_dir, arguments)
-                warnings = [protocol.status(protocol.WARNING, problem) for problem in problems]
-                return [*warnings, protocol.parameter_values(values, request)]
+                values = await asyncio.to_thread(read_parameters, self._run_dir, arguments)
+                return [protocol.parameter_values(values, request)]
             case "setParameters" | "advertise":
                 text = "this server is for viewing: set parameters with `ic param set`, drive on the operator's page"
                 return [protocol.status(protocol.ERROR, text)]
