@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import dataclasses
 import fnmatch
+import functools
+import itertools
+import math
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -143,70 +146,60 @@ class _Comparison:
 
     def run(self) -> TopicDifference:
         if all(self._types) and set(self._types[0]) != set(self._types[1]):
-            self.first = " and ".join(", ".join(sorted(types)) for types in self._types)
-            self.first = f"types {self.first}"
-        counts, only, number, differing = [0, 0], [0, 0], 0, 0
+            self.first = "types " + " and ".join(", ".join(sorted(types)) for types in self._types)
+        only_a = only_b = both = differing = 0
         for left, right in self._pairs():
-            counts[0] += left is not None
-            counts[1] += right is not None
-            if left is None or right is None:
-                only[left is None] += 1
-                missing = left or right
-                if self.tolerance.stamp_s is not None and missing is not None:
-                    name = "first" if left is not None else "second"
-                    self.first = (
-                        self.first or f"the message at {missing.stamp_ns / 1e9:.6f} s is only in the {name} bag"
-                    )
-                continue
-            number += 1
-            differing += self._differ(left, right, number)
-        if not self.first and counts[0] != counts[1]:
-            self.first = f"{counts[0]} and {counts[1]} messages"
-        return TopicDifference(self.topic, counts[0], counts[1], self.first, only[0], only[1], differing, self.fields)
+            if left is not None and right is not None:
+                both += 1
+                difference = self._difference(left, right, both)
+                differing += bool(difference)
+                self._note(f"message {both}: {difference}" if difference else "")
+            elif missing := left or right:
+                only_a, only_b = only_a + (left is not None), only_b + (right is not None)
+                name = "first" if left is not None else "second"
+                if self.tolerance.stamp_s is not None:
+                    self._note(f"the message at {missing.stamp_ns / 1e9:.6f} s is only in the {name} bag")
+        if only_a != only_b:
+            self._note(f"{both + only_a} and {both + only_b} messages")
+        counts = (both + only_a, both + only_b)
+        return TopicDifference(self.topic, *counts, self.first, only_a, only_b, differing, self.fields)
+
+    def _note(self, text: str) -> None:
+        self.first = self.first or text
 
     def _pairs(self) -> Iterator[tuple[BagMessage | None, BagMessage | None]]:
+        """Yield pairs of messages by their order, or by their stamps; None is a missing partner."""
         one, two = (reader.messages({self.topic}) for reader in self._readers)
+        if self.tolerance.stamp_s is None:
+            yield from itertools.zip_longest(one, two)
+            return
+        within_ns = int(self.tolerance.stamp_s * 1e9)
         left, right = next(one, None), next(two, None)
-        within = None if self.tolerance.stamp_s is None else int(self.tolerance.stamp_s * 1e9)
         while left is not None or right is not None:
-            if left is not None and right is not None and within is not None:
-                gap = left.stamp_ns - right.stamp_ns
-                if gap < -within:
-                    yield left, None
-                    left = next(one, None)
-                    continue
-                if gap > within:
-                    yield None, right
-                    right = next(two, None)
-                    continue
-            yield left, right
-            left, right = next(one, None), next(two, None)
+            gap_ns = math.inf if left is None else -math.inf if right is None else left.stamp_ns - right.stamp_ns
+            in_a, in_b = gap_ns <= within_ns, gap_ns >= -within_ns
+            yield left if in_a else None, right if in_b else None
+            left, right = next(one, None) if in_a else left, next(two, None) if in_b else right
 
-    def _differ(self, left: BagMessage, right: BagMessage, number: int) -> bool:
+    def _difference(self, left: BagMessage, right: BagMessage, number: int) -> str:
+        """Return how two messages differ, and note the fields that do; empty where they are the same."""
         if self.tolerance.stamp_s is None and left.stamp_ns != right.stamp_ns:
-            apart = f"stamps differ by {(right.stamp_ns - left.stamp_ns) / 1e9:+.9f} s"
-            self.first = self.first or f"message {number}: {apart}"
-            return True
+            return f"stamps differ by {(right.stamp_ns - left.stamp_ns) / 1e9:+.9f} s"
         if left.payload == right.payload:
-            return False
+            return ""
         if left.type_name != right.type_name:
-            self.first = self.first or f"message {number}: {left.type_name} and {right.type_name}"
-            return True
+            return f"{left.type_name} and {right.type_name}"
         try:
-            decoded = [self._decode(which, message) for which, message in enumerate((left, right))]
+            found = self._differing_fields(self._decode(0, left), self._decode(1, right))
         except BagError:
-            self.first = self.first or f"message {number}: the bytes differ; {left.type_name} is unknown here"
-            return True
-        found = dict(self._values(decoded[0], decoded[1], ""))
-        for path, (words, size) in found.items():
-            entry = self.fields.setdefault(path, FieldDifference(0, number, size, words))
+            return f"the bytes differ; {left.type_name} is unknown here"
+        for name, (text, size) in found.items():
+            entry = self.fields.setdefault(name, FieldDifference(0, number, size, text))
             entry.messages += 1
             entry.largest = max(entry.largest, size) if entry.largest == entry.largest else entry.largest
-        if found:
-            self.first = self.first or f"message {number}: {next(iter(found.values()))[0]}"
-        elif self.tolerance.exact:
-            self.first = self.first or f"message {number}: the bytes differ, but no field does (padding)"
-        return bool(found) or self.tolerance.exact
+        if not found and self.tolerance.exact:
+            return "the bytes differ, but no field does (padding)"
+        return next(iter(found.values()))[0] if found else ""
 
     def _decode(self, which: int, message: BagMessage) -> Any:
         key = (which, message.type_name)
@@ -214,67 +207,70 @@ class _Comparison:
             self._decoders[key] = self._readers[which].decoder(self._types[which][message.type_name])
         return self._decoders[key](message.payload)
 
-    def _values(self, a: Any, b: Any, path: str) -> Iterator[tuple[str, tuple[str, float]]]:
-        """Yield each field that differs beyond the tolerance: path → (text, size); a list gives its largest."""
-        if path and self.tolerance.ignores(self.topic, path):
-            return
-        if dataclasses.is_dataclass(a) and not isinstance(a, type):
-            for item in dataclasses.fields(a):
-                if not item.name.startswith("__"):
-                    inner = f"{path}.{item.name}" if path else item.name
-                    yield from self._values(getattr(a, item.name), getattr(b, item.name, None), inner)
-        elif isinstance(a, np.ndarray) and isinstance(b, np.ndarray):
-            yield from self._arrays(a, b, path)
-        elif isinstance(a, list) and isinstance(b, list):
-            if len(a) != len(b):
-                yield path, (f"{path} has {len(a)} and {len(b)} entries", float("nan"))
-                return
-            largest: dict[str, tuple[str, float]] = {}
-            for index, (x, y) in enumerate(zip(a, b, strict=True)):
-                for inner, (words, size) in self._values(x, y, f"{path}[]"):
-                    text = words.replace(f"{path}[]", f"{path}[{index}]", 1)
-                    if inner not in largest or size > largest[inner][1]:
-                        largest[inner] = (largest.get(inner, (text, 0.0))[0], size)
-            yield from largest.items()
-        elif isinstance(a, float) and isinstance(b, float) and not isinstance(a, bool):
-            yield from self._arrays(np.array([a]), np.array([b]), path, scalar=True)
-        elif a != b:
-            atol = self.tolerance.of(self.topic, path)
-            numbers = isinstance(a, int) and isinstance(b, int) and not isinstance(a, bool)
-            size = float(abs(a - b)) if numbers else float("nan")
-            if not (numbers and size <= atol):
-                yield path, (f"{path} is {a!r} and {b!r}", size)
+    def _differing_fields(self, a: Any, b: Any) -> dict[str, tuple[str, float]]:
+        """Return name → (text, size) of the fields that differ beyond the tolerance; for a list, its largest."""
+        found: dict[str, tuple[str, float]] = {}
+        for path, x, y in _leaves(a, b, ""):
+            name = re.sub(r"\[\d+\]", "[]", path)
+            if self.tolerance.ignores(self.topic, name):
+                continue
+            difference = _difference(x, y, self.tolerance.of(self.topic, name))
+            if difference is not None:
+                text, size = f"{path}{difference[0]}", difference[1]
+                if name not in found or size > found[name][1]:
+                    found[name] = (found[name][0] if name in found else text, size)
+        return found
 
-    def _arrays(
-        self, a: np.ndarray, b: np.ndarray, path: str, scalar: bool = False
-    ) -> Iterator[tuple[str, tuple[str, float]]]:
-        if a.shape != b.shape:
-            yield path, (f"{path} has {a.size} and {b.size} entries", float("nan"))
-            return
-        if not a.size:
-            return
-        a, b = a.ravel(), b.ravel()
-        atol = self.tolerance.of(self.topic, path)
-        wide = (a.astype(np.float64), b.astype(np.float64))
-        with np.errstate(invalid="ignore"):  # inf - inf
-            gap = np.abs(wide[0] - wide[1])
-            if atol:
-                equal = (a == b) | (np.isnan(wide[0]) & np.isnan(wide[1])) | (gap <= atol)
-            else:  # bit for bit: -0.0 differs from 0.0, and two nan are equal only when their bits are
-                bits = [np.ascontiguousarray(x).view(np.uint8).reshape(a.size, -1) for x in (a, b)]
-                equal = (bits[0] == bits[1]).all(axis=1)
-        different = np.flatnonzero(~equal)
-        if not different.size:
-            return
-        index, size = int(different[0]), float(np.max(gap[different]))
-        x, y = a[index].item(), b[index].item()
-        if scalar:
-            yield path, (f"{path} is {x!r} and {y!r}", size)
+
+def _leaves(a: Any, b: Any, path: str) -> Iterator[tuple[str, Any, Any]]:
+    """Yield path and values of the fields of two messages that are no messages themselves."""
+    if dataclasses.is_dataclass(a):
+        for item in dataclasses.fields(a):
+            if not item.name.startswith("__"):
+                inner = f"{path}.{item.name}" if path else item.name
+                yield from _leaves(getattr(a, item.name), getattr(b, item.name, None), inner)
+    elif isinstance(a, list) and isinstance(b, list) and len(a) == len(b):
+        for index, (x, y) in enumerate(zip(a, b, strict=True)):
+            yield from _leaves(x, y, f"{path}[{index}]")
+    else:
+        yield path, a, b
+
+
+def _difference(a: Any, b: Any, atol: float) -> tuple[str, float] | None:
+    """Return how two values differ, as text and as a number (nan for non-numbers); None within the tolerance.
+
+    Without a tolerance numbers are compared bit for bit: -0.0 differs from 0.0, two nan are equal if their bits are.
+    """
+    if isinstance(a, np.ndarray | list) and isinstance(b, np.ndarray | list) and len(a) != len(b):
+        return f" has {len(a)} and {len(b)} entries", math.nan
+    if not (_numeric(a) and _numeric(b)):
+        return None if a == b else (f" is {a!r} and {b!r}", math.nan)
+    x, y = np.ravel(a), np.ravel(b)
+    if not x.size:
+        return None
+    wide = (x.astype(np.float64), y.astype(np.float64))
+    with np.errstate(invalid="ignore"):  # inf - inf
+        gap = np.abs(wide[0] - wide[1])
+        if atol:
+            equal = (x == y) | (np.isnan(wide[0]) & np.isnan(wide[1])) | (gap <= atol)
         else:
-            many = f"({different.size} of {a.size} entries differ)"
-            yield path, (f"{path}[{index}] is {x!r} and {y!r} {many}", size)
+            bits = [np.ascontiguousarray(value).view(np.uint8).reshape(value.size, -1) for value in (x, y)]
+            equal = (bits[0] == bits[1]).all(axis=1)
+    different = np.flatnonzero(~equal)
+    if not different.size:
+        return None
+    index, size = int(different[0]), float(np.max(gap[different]))
+    values = f" is {x[index].item()!r} and {y[index].item()!r}"
+    if not isinstance(a, np.ndarray):
+        return values, size
+    return f"[{index}]{values} ({different.size} of {x.size} entries differ)", size
 
 
+def _numeric(value: Any) -> bool:
+    return isinstance(value, np.ndarray) or (isinstance(value, int | float) and not isinstance(value, bool))
+
+
+@functools.lru_cache(maxsize=10_000)  # asked for each field of each message
 def _matches(pattern: str, topic: str, path: str) -> bool:
     if pattern.startswith("/"):
         wanted, _, pattern = pattern.partition(":")
