@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from instant_ic.geometry.projections import equirect_directions
+
 if TYPE_CHECKING:
     from instant_ic.sim.render import EquirectRenderer
 
@@ -51,16 +53,12 @@ class RangeErrors:
 
 
 def measure(
-    depth_m: Floats,
-    lidar_height_m: float,
-    camera_height_m: float,
-    errors: RangeErrors | None = None,
+    depth_m: Floats, lidar_height_m: float, camera_height_m: float, errors: RangeErrors | None = None
 ) -> NDArray[np.float32]:
     """Simulate one revolution of a VLP-16 on the camera's vertical, from a level depth image.
 
-    LiDAR and camera share a vertical axis, so each beam stays in one column of the image. There the image is a profile
-    of the room, and a beam ends where it first meets the profile. A beam gives no point where it passes behind a
-    visible surface (through a depth discontinuity) or through unknown pixels, because its end is unknown.
+    LiDAR and camera share a vertical axis, so each beam stays in one column of the image. It ends at the nearest pixel
+    of its column that lies on its ring, within the height of a pixel. What the camera does not see gives no points.
 
     Args:
         depth_m: radial depth of a level panorama in metres, (H, W); 0 or not finite is unknown.
@@ -76,27 +74,21 @@ def measure(
     """
     if depth_m.ndim != 2 or min(depth_m.shape) < 4:
         raise ValueError(f"depth_m must be (H, W) (got {depth_m.shape})")
-    below_m = lidar_height_m - camera_height_m
-    if not math.isfinite(below_m):
+    mount = np.array([0.0, 0.0, lidar_height_m - camera_height_m])
+    if not math.isfinite(mount[2]):
         raise ValueError(f"heights must be numbers (got {lidar_height_m}, {camera_height_m})")
-    height = len(depth_m)
+    height, width = depth_m.shape
     known = np.isfinite(depth_m) & (depth_m > 1e-3)
-    inverse = np.where(known, 1.0 / np.where(known, depth_m, 1.0), 0.0)
-    azimuth = math.pi - (np.arange(AZIMUTHS) + 0.5) * (2 * math.pi / AZIMUTHS)
-    profile = _profiles(inverse, azimuth)
-    elevation = math.pi / 2 - (np.arange(height) + 0.5) * (math.pi / height)
-    depth_edge = _depth_edges(profile, math.pi / height)[:-1] | ((profile[1:] > 0) ^ (profile[:-1] > 0))
-    profile, depth_edge = _bridge_unknown(profile, depth_edge)
-    radius = np.where(profile > 0, 1.0 / np.where(profile > 0, profile, 1.0), np.nan)
-    across, up = radius * np.cos(elevation)[:, None], radius * np.sin(elevation)[:, None] - below_m
-
-    points = []
-    for omega in np.radians(np.linspace(-15, 15, 16)):
-        range_m = _first_crossing(across, up, depth_edge, omega)
-        hit = (range_m >= MIN_RANGE_M) & (range_m <= MAX_RANGE_M)
-        points.append(_on_rays(omega, azimuth[hit], range_m[hit]))
-    true = np.concatenate(points)
-    return _measured(true, errors or RangeErrors(), np.array([0.0, 0.0, below_m]))
+    points = equirect_directions(width, height) * np.where(known, depth_m, 1.0)[..., None] - mount
+    range_m = np.linalg.norm(points, axis=2)
+    elevation_deg = np.degrees(np.arcsin(points[..., 2] / np.maximum(range_m, 1e-9)))
+    ring = np.clip(np.rint((elevation_deg + 15) / 2), 0, 15).astype(np.intp)
+    on_ring = np.abs(elevation_deg - (2 * ring - 15)) < 0.5 * 180 / height
+    row, column = np.nonzero(known & on_ring & (range_m >= MIN_RANGE_M) & (range_m <= MAX_RANGE_M))
+    order = np.argsort(range_m[row, column])
+    row, column = row[order], column[order]
+    _, first = np.unique(ring[row, column] * width + column, return_index=True)  # the nearest on each beam
+    return _measured(points[row[first], column[first]], errors or RangeErrors(), mount)
 
 
 def measure_world(
@@ -144,59 +136,3 @@ def _measured(points: Floats, errors: RangeErrors, mount: Floats) -> NDArray[np.
     """Apply errors along the rays to points (N, 3) from the LiDAR at ``mount`` (3,)."""
     range_m = np.linalg.norm(points, axis=1)
     return (points * (errors.apply(range_m) / range_m)[:, None] + mount).astype(np.float32)
-
-
-def _depth_edges(inverse: Floats, step_rad: float) -> NDArray[np.bool_]:
-    """Mark depth discontinuities between each row of inverse depth (H, W) and the next, and between last and first row.
-
-    An edge is marked where the surface is seen at less than 1 degree, or at less than 8 degrees while the inverse
-    depth, which is smooth over any plane, jumps.
-    """
-    following = np.roll(inverse, -1, axis=0)
-    jump = np.abs(following - inverse)
-    # Legs of a right-angled triangle: step_rad * range across the ray, the range difference along it.
-    slope = jump / np.maximum(step_rad * np.maximum(np.minimum(inverse, following), 1e-9), 1e-12)
-    alike = np.maximum(np.roll(jump, 1, axis=0), np.roll(jump, -1, axis=0))
-    return (slope > 1 / math.tan(math.radians(1))) | ((slope > 1 / math.tan(math.radians(8))) & (jump > 2 * alike))
-
-
-def _profiles(inverse: Floats, azimuth: Floats) -> NDArray[np.float64]:
-    """Return columns (H, N) of inverse depth (H, W) at azimuths (N,), interpolated only on a surface."""
-    width = inverse.shape[1]
-    u = (math.pi - azimuth) * (width / (2 * math.pi)) - 0.5
-    left = np.floor(u).astype(np.intp)
-    share = u - left
-    depth_edge = _depth_edges(np.ascontiguousarray(inverse.T), 2 * math.pi / width).T
-    a, b = inverse[:, left % width], inverse[:, (left + 1) % width]
-    apart = depth_edge[:, left % width] | (a == 0) | (b == 0)
-    return np.where(apart, np.where(share < 0.5, a, b), (1 - share) * a + share * b)
-
-
-def _bridge_unknown(
-    profile: NDArray[np.float64], depth_edge: NDArray[np.bool_]
-) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """Fill unknown pixels from above (the first from below) and mark them: beams that pass through them have no end."""
-    known = profile > 0
-    row = np.where(known, np.arange(len(profile))[:, None], -1)
-    above = np.maximum.accumulate(row, axis=0)
-    first = np.where(known.any(axis=0), known.argmax(axis=0), -1)
-    above = np.where(above < 0, first, above)
-    filled = np.where(above < 0, 0.0, np.take_along_axis(profile, np.maximum(above, 0), axis=0))
-    return filled, depth_edge | ~known[:-1] | ~known[1:]
-
-
-def _first_crossing(across: Floats, up: Floats, depth_edge: NDArray[np.bool_], omega: float) -> NDArray[np.float64]:
-    """Return the ranges (N,) at which beams of elevation ``omega`` first meet profiles (H, N).
-
-    The range is inf where a beam meets none, or meets it at a discontinuity.
-    """
-    side = across * math.sin(omega) - up * math.cos(omega)
-    along = across * math.cos(omega) + up * math.sin(omega)
-    s0, s1 = side[:-1], side[1:]
-    crosses = (s0 > 0) != (s1 > 0)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        range_m = (along[:-1] * s1 - along[1:] * s0) / (s1 - s0)
-    range_m = np.where(crosses & (range_m > 0), range_m, np.inf)
-    nearest = np.argmin(range_m, axis=0)[None]
-    end = np.take_along_axis(range_m, nearest, axis=0)[0]
-    return np.where(np.take_along_axis(depth_edge, nearest, axis=0)[0], np.inf, end)
