@@ -44,8 +44,8 @@ def add_parser(commands: Any) -> None:
         "train",
         help="train depth completion on rendered panoramas",
         description="Train the completion network on rendered panoramas (ic depth render) and export it. Ctrl-C ends\n"
-        "the training early: the last weights are evaluated, saved and exported. A CSV of the progress, whose first\n"
-        "evaluation is that of the fused depth, is written beside the checkpoint.",
+        "the training early: the last weights are evaluated, saved and exported. The checkpoint's record has all\n"
+        "evaluations; the first one is that of the fused depth.",
         epilog=_EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )

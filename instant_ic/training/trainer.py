@@ -27,7 +27,6 @@ from instant_ic.training.checkpoints import CheckpointError, read_checkpoint
 from instant_ic.training.completion import CompletionNet
 from instant_ic.training.dataset import Sample
 from instant_ic.training.feeds import Batch, Feed, stack
-from instant_ic.training.log import TrainingLog
 from instant_ic.training.losses import depth_loss, edge_loss, sigma_loss
 from instant_ic.util.files import replacing
 
@@ -276,47 +275,36 @@ class Trainer:
 
     def run(self) -> DepthMetrics:
         """Train to the end of the schedule; return the metrics over all held-out panoramas."""
-        log = TrainingLog(self.output, self.step, self.report)
+        self.output.parent.mkdir(parents=True, exist_ok=True)
         begin = time.monotonic() - self.elapsed_s
-        last_checkpoint, last_row, losses = time.monotonic(), (time.monotonic(), self.step), []
-        try:
-            if not self.history:
-                self._checkpoint(log, self._evaluate(self._picked()), [])  # the prior
-            while self.progress < 1.0 and not self.stop:
-                losses.append(self.train_step())
+        last_checkpoint, last_report, losses = time.monotonic(), (time.monotonic(), self.step), []
+        if not self.history:
+            self._checkpoint(self._evaluate(self._picked()), [])  # the prior
+        while self.progress < 1.0 and not self.stop:
+            losses.append(self.train_step())
+            self.elapsed_s = time.monotonic() - begin
+            self.bar(self.progress)
+            now = time.monotonic()
+            if self.step % 50 == 0 or now - last_report[0] > 60:
+                last_report = self._report(losses, *last_report)
+            if now - last_checkpoint > self.config.checkpoint_s:
+                self._checkpoint(self._evaluate(self._picked()), losses)
                 self.elapsed_s = time.monotonic() - begin
-                self.bar(self.progress)
-                now = time.monotonic()
-                if self.step % 50 == 0 or now - last_row[0] > 60:
-                    last_row = self._row(log, losses, *last_row)
-                if now - last_checkpoint > self.config.checkpoint_s:
-                    self._checkpoint(log, self._evaluate(self._picked()), losses)
-                    self.elapsed_s = time.monotonic() - begin
-                    last_checkpoint, last_row = time.monotonic(), (time.monotonic(), self.step)
-            self._row(log, losses, *last_row)
-            final = self._evaluate(self.held_out)
-            self._checkpoint(log, final, losses)
-            return final
-        finally:
-            log.close()
+                last_checkpoint, last_report = time.monotonic(), (time.monotonic(), self.step)
+        final = self._evaluate(self.held_out)
+        self._checkpoint(final, losses)
+        return final
 
     def close(self) -> None:
         """Close the feed."""
         self.feed.close()
 
-    def _row(self, log: TrainingLog, losses: list[float], since: float, since_step: int) -> tuple[float, int]:
-        """Write loss and speed since a time and step; return the current ones."""
+    def _report(self, losses: list[float], since: float, since_step: int) -> tuple[float, int]:
+        """Report loss and speed since a time and step; return the current ones."""
         now, count = time.monotonic(), self.step - since_step
-        if count:
-            rate = count * self.config.batch_size / (now - since)
-            row = {
-                "step": self.step, "minutes": round(self.elapsed_s / 60, 2),
-                "loss": round(float(np.mean(losses[-count:])), 5),
-                "learning_rate": self.config.learning_rate * schedule(self.progress, self.config.warmup),
-                "panoramas_per_s": round(rate, 2),
-            }  # fmt: skip
-            log.row(row, f"step {self.step} epoch {self.step / self.feed.steps_an_epoch:.2f} "
-                         f"loss {row['loss']:.4f} {rate:.1f} panoramas/s {100 * self.progress:.0f} %")  # fmt: skip
+        loss, rate = np.mean(losses[-count:]), count * self.config.batch_size / (now - since)
+        self.report(f"step {self.step} epoch {self.step / self.feed.steps_an_epoch:.2f} loss {loss:.4f} "
+                    f"{rate:.1f} panoramas/s {100 * self.progress:.0f} %")  # fmt: skip
         return now, self.step
 
     def _picked(self) -> list[Sample]:
@@ -326,7 +314,7 @@ class Trainer:
     def _evaluate(self, samples: Sequence[Sample]) -> DepthMetrics:
         return evaluate(self.average, samples, self.config.max_range_m, self.config.brightness)
 
-    def _checkpoint(self, log: TrainingLog, metrics: DepthMetrics, losses: list[float]) -> None:
+    def _checkpoint(self, metrics: DepthMetrics, losses: list[float]) -> None:
         entry: dict[str, Any] = {"step": self.step, "minutes": round(self.elapsed_s / 60, 1), **metrics.as_dict()}
         entry["loss"] = round(float(np.mean(losses[-100:])), 5) if losses else None
         self.history.append(entry)
@@ -344,7 +332,7 @@ class Trainer:
         }
         with replacing(self.output) as file:
             torch.save(state, file)
-        log.row({**entry, "loss": None}, f"held-out panoramas: {entry}")
+        self.report(f"held-out panoramas: {entry}")
 
     def record(self) -> dict[str, Any]:
         """Return the origin of the weights as plain values: command, start, data, network, training and results."""

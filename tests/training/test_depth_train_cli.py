@@ -53,7 +53,6 @@ def test_rendered_panoramas_and_taken_up_again(tmp_path: Path, capsys: pytest.Ca
     assert record(weights)["data"] == {"folder": "p", "worlds": 9, "panoramas": 16}
     said = capsys.readouterr().out
     assert "training on CPU" in said and json.loads(said.splitlines()[-1])["mre"] > 0
-    assert weights.with_suffix(".csv").read_text().splitlines()[-1].startswith("4,")
     assert ic(*words, "--epochs", "2", "--resume") == 0
     assert record(weights)["steps"] == 8 and len(record(weights)["history"]) == 3
 

@@ -1,6 +1,5 @@
 """Training on a few striped images: it learns, repeats, resumes, and records what it did."""
 
-import csv
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -77,16 +76,6 @@ def test_record_tells_what_made_the_weights(trained: SimpleNamespace) -> None:
     assert record["device"].startswith("CPU") and record["start"] == {}
     assert record["history"][-1]["mre"] == round(trained.metrics.mre, 5)
     json.dumps(record)
-
-
-def test_csv_has_losses_and_metrics(trained: SimpleNamespace) -> None:
-    with trained.path.with_suffix(".csv").open(newline="") as file:
-        rows = list(csv.DictReader(file))
-    assert [row["step"] for row in rows if row["loss"]][-1] == "36"
-    assert float(rows[0]["mre"]) > 0 and rows[0]["loss"] == ""  # of the prior
-    assert float(rows[1]["loss"]) > 0 and float(rows[1]["panoramas_per_s"]) > 0 and rows[1]["mre"] == ""
-    assert float(rows[-1]["mre"]) == round(trained.metrics.mre, 5)
-    assert any("held-out" in line for line in trained.lines)
 
 
 def test_same_seed_gives_the_same_weights_also_when_taken_up_again(tmp_path: Path) -> None:
