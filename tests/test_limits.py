@@ -17,12 +17,11 @@ import pytest
 
 from instant_ic.depth.files import DepthFileError, load_depth, load_picture
 from instant_ic.experiments.slam_logs import LogError, read_log
-from instant_ic.geometry.mesh_file import MeshError
+from instant_ic.geometry.mesh_file import MeshError, load_mesh
 from instant_ic.slam.map_files import MapError, load_grid
 from instant_ic.util.jpeg import JpegError
 from instant_ic.util.limits import MOST_ARRAY_BYTES, check_arrays, decode_image, decode_rgb, load_image
 from instant_ic.vspace.saved import SpaceFileError, read
-from instant_ic.vspace.scanned_mesh import load_mesh
 
 
 def png(width: int, height: int, bits: int = 8) -> bytes:

@@ -11,10 +11,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from instant_ic.geometry.colour import linear_to_srgb
+
+Floats = NDArray[np.float32]
 SUFFIXES = (".glb", ".gltf", ".ply", ".obj")
 Y_UP_SUFFIXES = (".glb", ".gltf")
 MAX_FILE_BYTES = 2 << 30
 """Larger files are refused unread: their triangles would not fit into the memory of a robot's station."""
+GREY = 0.85
+"""Colour of a surface without any, sRGB 0 to 1."""
 _Z_UP_FROM_Y_UP = np.array([[1.0, 0, 0], [0, 0, -1.0], [0, 1.0, 0]])
 """glTF has y up and looks along z: (x, y, z) becomes (x, −z, y)."""
 
@@ -24,30 +29,26 @@ class MeshError(ValueError):
 
 
 @dataclass(frozen=True)
-class MeshPart:
-    """One geometry at one node of a scene.
+class ColouredMesh:
+    """Triangles with their colours.
 
     Attributes:
-        vertices: corners in metres, z up, (V, 3).
-        faces: indices of the triangles' corners, (F, 3).
-        corner_uv: texture coordinates of the triangles' corners, v downwards, (F, 3, 2); None without a texture.
-        image: the texture, a PIL image; None without one.
-        factor: colour of the material, 0 to 1, (3,), by which the texture is multiplied; None if it has none.
-        factor_is_linear: ``factor`` is linear light (glTF) and not sRGB.
-        visual: visual of trimesh, with the colours of vertices and faces.
+        triangles: corners in metres, z up, (T, 3, 3).
+        corner_uv: texture coordinates of the corners, v downwards, 1 = the whole image, (T, 3, 2).
+        corner_rgb: sRGB colours of the corners, 0 to 255, (T, 3, 3); used where there is no texture.
+        texture: index of each triangle's image, −1 for none, (T,).
+        images: textures in the colour of their material, sRGB, (H, W, 3) uint8 each.
     """
 
-    vertices: NDArray[np.float64]
-    faces: NDArray[np.integer]
-    corner_uv: NDArray[np.floating] | None
-    image: Any
-    factor: NDArray[np.float64] | None
-    factor_is_linear: bool
-    visual: Any
+    triangles: Floats
+    corner_uv: Floats
+    corner_rgb: Floats
+    texture: NDArray[np.int32]
+    images: list[NDArray[np.uint8]]
 
 
-def load_parts(path: str | Path, max_triangles: int = 5_000_000) -> list[MeshPart]:
-    """Load the geometries of a file that have faces, node transforms applied, z up.
+def load_mesh(path: str | Path, max_triangles: int = 5_000_000) -> ColouredMesh:
+    """Load the triangles of a file that have an area, with node transforms applied.
 
     glTF has y up by its standard and is turned; the others are taken as they are, with z up.
 
@@ -67,10 +68,11 @@ def load_parts(path: str | Path, max_triangles: int = 5_000_000) -> list[MeshPar
     size = path.stat().st_size
     if size > MAX_FILE_BYTES:
         raise MeshError(f"mesh {path}: {size / 2**30:.1f} GiB, at most {MAX_FILE_BYTES >> 30} are read. Simplify it")
+    images: dict[tuple[int, bytes], NDArray[np.uint8]] = {}
     try:
         if suffix in Y_UP_SUFFIXES:
             _check_accessors(path, 3 * max_triangles)
-        parts = list(_parts(path, max_triangles))
+        parts = list(_parts(path, max_triangles, images))
     except MeshError:
         raise
     except MemoryError as error:
@@ -81,7 +83,18 @@ def load_parts(path: str | Path, max_triangles: int = 5_000_000) -> list[MeshPar
         ) from error
     if not parts:
         raise MeshError(f"mesh {path}: holds no triangles. Is it a point cloud? Mesh it first")
-    return parts
+    triangles, uv, rgb, texture = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
+    twice_area = np.linalg.norm(doubled_areas(triangles), axis=1)
+    keep = np.isfinite(twice_area) & (twice_area > 1e-12)
+    if not keep.any():
+        raise MeshError(f"mesh {path}: holds no triangles with an area. Is it a point cloud? Mesh it first")
+    return ColouredMesh(triangles[keep], uv[keep], rgb[keep], texture[keep], list(images.values()))
+
+
+def doubled_areas(triangles: Floats) -> NDArray[np.float64]:
+    """Return the normals of triangles (T, 3, 3), of the length of twice their areas, (T, 3)."""
+    edges = triangles[:, 1:] - triangles[:, :1]
+    return np.cross(edges[:, 0].astype(np.float64), edges[:, 1])
 
 
 def _check_accessors(path: Path, most: int) -> None:
@@ -105,7 +118,16 @@ def _check_accessors(path: Path, most: int) -> None:
             )
 
 
-def _parts(path: Path, max_triangles: int) -> Iterator[MeshPart]:
+def _parts(
+    path: Path, max_triangles: int, images: dict[tuple[int, bytes], NDArray[np.uint8]]
+) -> Iterator[tuple[Floats, Floats, Floats, NDArray[np.int32]]]:
+    """Yield the arrays of ``ColouredMesh`` of each geometry that has faces, at each of its nodes; collect the images.
+
+    Args:
+        path: the file.
+        max_triangles: largest number of triangles.
+        images: textures by the id of the file's image and the material's colour.
+    """
     import trimesh
 
     scene = trimesh.load_scene(str(path), process=False)
@@ -126,31 +148,49 @@ def _parts(path: Path, max_triangles: int) -> Iterator[MeshPart]:
         faces = np.asarray(mesh.faces)
         if faces.min() < 0 or faces.max() >= len(vertices):
             raise MeshError(f"mesh {path}: damaged, a triangle has a corner that is not there")
-        image, factor, linear = _material(getattr(mesh.visual, "material", None))
-        uv, corner_uv = getattr(mesh.visual, "uv", None), None
-        if image is None or uv is None or len(uv) != len(vertices):
-            image = None
-        else:
-            image.load()  # an error in its data is the file's
-            corner_uv = np.asarray(uv)[faces]
+        image, colour = _material(getattr(mesh.visual, "material", None))
+        uv, number = getattr(mesh.visual, "uv", None), -1
+        corner_uv = np.zeros((*faces.shape, 2), np.float32)
+        if image is not None and uv is not None and len(uv) == len(vertices):
+            key = id(image), colour.tobytes()
+            if key not in images:
+                images[key] = np.rint(np.asarray(image.convert("RGB")) * np.clip(colour, 0, 1)).astype(np.uint8)
+            number = list(images).index(key)
+            corner_uv[...] = np.asarray(uv)[faces]
             corner_uv[..., 1] = 1 - corner_uv[..., 1]  # trimesh's v runs upwards, an image's rows downwards
-        yield MeshPart(vertices, faces, corner_uv, image, factor, linear, mesh.visual)
+        rgb = 255 * _corner_colours(mesh.visual, faces, colour)
+        yield vertices[faces].astype(np.float32), corner_uv, rgb, np.full(len(faces), number, np.int32)
 
 
-def in_shares(colour: Any) -> NDArray[np.float64]:
-    """Return colours as shares of 1; integers are of their type's range, as trimesh keeps them."""
-    values = np.asarray(colour)
-    return values / np.iinfo(values.dtype).max if values.dtype.kind in "ui" else values.astype(np.float64)
-
-
-def _material(material: Any) -> tuple[Any, NDArray[np.float64] | None, bool]:
-    """Return image, colour factor, and True for a linear factor, of a trimesh material or None."""
+def _material(material: Any) -> tuple[Any, Floats]:
+    """Return the image of a trimesh material, or None, and its colour, sRGB 0 to 1, (3,)."""
     if material is None:
-        return None, None, False
+        return None, np.full(3, GREY, np.float32)
     image = getattr(material, "baseColorTexture", None)
     image = getattr(material, "image", None) if image is None else image
     linear = getattr(material, "baseColorFactor", None)
     if linear is not None:
-        return image, in_shares(linear)[:3], True
+        return image, linear_to_srgb(_in_shares(linear)[:3])
     diffuse = getattr(material, "diffuse", None)
-    return image, None if diffuse is None or image is not None else in_shares(diffuse)[:3], False
+    if image is not None:
+        return image, np.ones(3, np.float32)
+    return None, np.full(3, GREY, np.float32) if diffuse is None else _in_shares(diffuse)[:3]
+
+
+def _corner_colours(visual: Any, faces: NDArray[np.integer], colour: Floats) -> Floats:
+    """Return the colours of the corners, 0 to 1, (T, 3, 3), from the vertices, the faces, or the material."""
+    kind = getattr(visual, "kind", None)
+    if kind == "vertex":
+        return _in_shares(visual.vertex_colors)[faces][..., :3]
+    if kind == "face":
+        return np.repeat(_in_shares(visual.face_colors)[:, None, :3], 3, axis=1)
+    attributes = getattr(visual, "vertex_attributes", {})
+    if "color" in attributes:  # of glTF, beside a material
+        return _in_shares(attributes["color"])[faces][..., :3]
+    return np.tile(colour, (*faces.shape, 1))
+
+
+def _in_shares(colour: Any) -> Floats:
+    """Return colours as shares of 1; integers are of their type's range, as trimesh keeps them."""
+    values = np.asarray(colour)
+    return (values / np.iinfo(values.dtype).max if values.dtype.kind in "ui" else values).astype(np.float32)

@@ -1,20 +1,15 @@
 """Worlds from mesh files (GLB, glTF, PLY, OBJ)."""
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from instant_ic.geometry.mesh_file import load_parts
+from instant_ic.geometry.colour import srgb_to_linear
+from instant_ic.geometry.mesh_file import doubled_areas, load_mesh
 from instant_ic.sim.lighting import bake_mesh
-from instant_ic.sim.textures import srgb_to_linear, texture_set
+from instant_ic.sim.textures import texture_set
 from instant_ic.sim.world import World
-
-
-def _linear(image: Any) -> npt.NDArray[np.float32]:
-    """Convert a PIL image to linear light, (H, W, 3)."""
-    return srgb_to_linear(np.asarray(image.convert("RGB"), np.float32) / 255.0)
 
 
 def _affine_uv(triangles: npt.NDArray[np.float64], uv: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
@@ -56,55 +51,23 @@ def load_world(path: str | Path) -> World:
     Raises:
         ValueError: the file cannot be read or has no triangles.
     """
-    sources: list[str | npt.NDArray[np.floating]] = []
-    known: dict[int, int] = {}
-    arrays: list[dict[str, npt.NDArray[Any]]] = []
-    parts = load_parts(path)
-    for part in parts:
-        key = -1 if part.image is None else id(part.image)
-        corner_uv = np.zeros((*part.faces.shape, 2)) if part.corner_uv is None else part.corner_uv.astype(float)
-        if key not in known:
-            known[key] = len(sources)
-            sources.append(np.ones((1, 1, 3), np.float32) if part.image is None else _linear(part.image))
-        colour = part.factor
-        if colour is None:
-            colour = np.full(3, 0.7 if getattr(part.visual, "material", None) is None else 1.0)
-        triangles = part.vertices[part.faces]
-        arrays.append(
-            {
-                "triangles": triangles,
-                "uv": _affine_uv(triangles, corner_uv),
-                "texture": np.full(len(triangles), known[key], np.int32),
-                "tint": np.repeat(colour[None].astype(np.float32), len(triangles), axis=0),
-            }
-        )
-    world = _world(Path(path).name, {key: np.concatenate([part[key] for part in arrays]) for key in arrays[0]}, sources)
-    world.spawn = _spawn(world)
-    bake_mesh(world)
-    return world
-
-
-def _world(name: str, joined: dict[str, npt.NDArray[Any]], sources: list[str | npt.NDArray[np.floating]]) -> World:
-    """Build a world without light from the arrays of its triangles, leaving out those without an area."""
-    cross = np.cross(
-        joined["triangles"][:, 1] - joined["triangles"][:, 0], joined["triangles"][:, 2] - joined["triangles"][:, 0]
-    )
-    twice_area = np.linalg.norm(cross, axis=1)
-    keep = twice_area > 1e-10
-    joined = {key: value[keep] for key, value in joined.items()}
-    normal = cross[keep] / twice_area[keep, None]
-    triangles = joined["triangles"]
-    count = len(triangles)
-    return World(
-        name=name,
-        vertices=triangles.reshape(-1, 3).astype(np.float32),
+    mesh = load_mesh(path)
+    count, triangles = len(mesh.triangles), mesh.triangles.astype(np.float64)
+    cross = doubled_areas(mesh.triangles)
+    normal = cross / np.linalg.norm(cross, axis=1, keepdims=True)
+    tint = np.where(mesh.texture[:, None] < 0, srgb_to_linear(mesh.corner_rgb.mean(axis=1) / 255), np.float32(1))
+    images = [srgb_to_linear(image.astype(np.float32) / 255) for image in mesh.images]
+    sources: list[str | npt.NDArray[np.floating]] = [*images, np.ones((1, 1, 3), np.float32)]  # the last is plain
+    world = World(
+        name=Path(path).name,
+        vertices=mesh.triangles.reshape(-1, 3),
         faces=np.arange(3 * count, dtype=np.int32).reshape(-1, 3),
         face_surface=np.arange(count, dtype=np.int32),
         normal=normal.astype(np.float32),
         offset=np.einsum("ni,ni->n", normal, triangles[:, 0]).astype(np.float32),
-        uv=joined["uv"].astype(np.float32),
-        texture=joined["texture"],
-        tint=joined["tint"],
+        uv=_affine_uv(triangles, mesh.corner_uv.astype(np.float64)).astype(np.float32),
+        texture=np.where(mesh.texture < 0, len(images), mesh.texture).astype(np.int32),
+        tint=tint.astype(np.float32),
         emission=np.zeros(count, np.float32),
         textures=texture_set(sources, [False] * len(sources)),
         light_at=np.zeros((count, 3), np.int64),
@@ -112,3 +75,6 @@ def _world(name: str, joined: dict[str, npt.NDArray[Any]], sources: list[str | n
         light_linear=np.tile(np.asarray([0, 0, 0, 1], np.float32), (count, 1)),
         light=np.ones((1, 3), np.float32),
     )
+    world.spawn = _spawn(world)
+    bake_mesh(world)
+    return world

@@ -7,8 +7,8 @@ from functools import lru_cache
 import numpy as np
 import numpy.typing as npt
 
+from instant_ic.geometry.colour import linear_to_srgb
 from instant_ic.sim import kernels
-from instant_ic.sim.textures import linear_to_srgb
 from instant_ic.sim.world import World
 
 FloatArray = npt.NDArray[np.floating]

@@ -42,18 +42,6 @@ class TextureSet:
     mean: npt.NDArray[np.float32]
 
 
-def srgb_to_linear(value: FloatArray) -> npt.NDArray[np.float32]:
-    """Convert sRGB values in 0..1 to linear light (IEC 61966-2-1)."""
-    value = np.asarray(value, np.float32)
-    return np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4).astype(np.float32)
-
-
-def linear_to_srgb(value: FloatArray) -> npt.NDArray[np.float32]:
-    """Convert linear light in 0..1 to sRGB values (IEC 61966-2-1)."""
-    value = np.clip(np.asarray(value, np.float32), 0.0, None)
-    return np.where(value <= 0.0031308, value * 12.92, 1.055 * value ** (1 / 2.4) - 0.055).astype(np.float32)
-
-
 def _halve(image: FloatArray) -> npt.NDArray[np.float32]:
     height, width = image.shape[:2]
     if width > 1:

@@ -11,7 +11,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from instant_ic.sim.textures import TextureSet, srgb_to_linear, texture_set
+from instant_ic.geometry.colour import srgb_to_linear
+from instant_ic.sim.textures import TextureSet, texture_set
 from instant_ic.sim.world import World
 from instant_ic.training.dataset import DatasetError
 

@@ -33,7 +33,7 @@ def shade(  # type: ignore[no-untyped-def]
     """Colours where rays meet the mesh: texture (trilinear, by the pixel's footprint) or vertex colours.
 
     Args:
-        triangles ... levels: of the ``ScannedMesh``.
+        triangles ... texture: as in ``ColouredMesh``; texel_per_m ... levels: as in ``texel_pyramids``.
         origin: (3,); directions: (P, 3); range_m, face: (P,), what each ray meets, face −1 for nothing.
         pixel_rad: angle of a pixel.
         colour: out, (P, 3) in 0..1; 0 where nothing is met.

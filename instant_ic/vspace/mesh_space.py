@@ -13,15 +13,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from instant_ic.geometry.image_quality import psnr_of_mse
-from instant_ic.geometry.mesh_file import MeshError
+from instant_ic.geometry.mesh_file import MeshError, load_mesh
 from instant_ic.geometry.poses import pose_matrix
 from instant_ic.geometry.raycast import RayCaster
 from instant_ic.vspace.config import VirtualSpaceConfig
 from instant_ic.vspace.nerf.field import Floats, Rays
 from instant_ic.vspace.prior import KeyframeError, area_average
 from instant_ic.vspace.readiness import UNSEEN_GAIN, Texture
-from instant_ic.vspace.scanned_mesh import load_mesh
 from instant_ic.vspace.space import SpaceState, SpaceStatus, VirtualSpace
+from instant_ic.vspace.texel_pyramids import TexelPyramids, texel_density
 from instant_ic.vspace.view import RayRenderer, View, checked_pose, continue_unseen, equirect_rays
 
 EDGE_RATIO = 0.03
@@ -56,6 +56,7 @@ class MeshSpace(RayRenderer):
     def __init__(self, config: VirtualSpaceConfig) -> None:
         self.config = config
         self._mesh = load_mesh(config.mesh, config.mesh_max_triangles)
+        self._pyramids, self._texel_per_m = TexelPyramids.build(self._mesh.images), texel_density(self._mesh)
         x, y, z, yaw_deg = config.mesh_pose
         self._map_from_mesh = pose_matrix(x, y, z, yaw=math.radians(yaw_deg))
         triangles = self._mesh.triangles
@@ -146,7 +147,7 @@ class MeshSpace(RayRenderer):
     @property
     def status(self) -> SpaceStatus:
         """READY at once. ``psnr_db``: of the mesh at the newest keyframe against the camera; NaN before the first."""
-        low, high = self._mesh.bounds
+        corners = self._mesh.triangles.reshape(-1, 3)
         return SpaceStatus(
             state=SpaceState.READY,
             refreshing=False,
@@ -155,7 +156,7 @@ class MeshSpace(RayRenderer):
             train_seconds=0.0,
             ready_iterations=0,
             ms_per_iteration=0.0,
-            ready_radius_m=float(np.linalg.norm(high - low)),  # from any place in it to any other
+            ready_radius_m=float(np.linalg.norm(np.ptp(corners, axis=0))),  # from any place in it to any other
             converged=True,
             source="mesh",
             device="cpu (embree)",
@@ -204,12 +205,12 @@ class MeshSpace(RayRenderer):
     def _cast(self, origin: Floats, directions: Floats, pixel_rad: float) -> tuple[Floats, Floats, NDArray[np.int32]]:
         from instant_ic.vspace.mesh_kernels import shade
 
-        mesh = self._mesh
+        mesh, pyramids = self._mesh, self._pyramids
         range_m, face = self._caster.cast(origin, directions)
         colour = np.empty((len(face), 3), np.float32)
         shade(
-            mesh.triangles, mesh.corner_uv, mesh.corner_rgb, mesh.texture, mesh.texel_per_m, mesh.texels, mesh.start,
-            mesh.sizes, mesh.levels, origin, directions, range_m, face, pixel_rad, colour,
+            mesh.triangles, mesh.corner_uv, mesh.corner_rgb, mesh.texture, self._texel_per_m, pyramids.texels,
+            pyramids.start, pyramids.sizes, pyramids.levels, origin, directions, range_m, face, pixel_rad, colour,
         )  # fmt: skip
         return colour, np.where(face >= 0, range_m, 0).astype(np.float32), face
 
@@ -222,7 +223,7 @@ class MeshSpace(RayRenderer):
             for half in (np.s_[1:], np.s_[:-1]):
                 edge[(half, np.s_[:]) if axis == 0 else (np.s_[:], half)] |= jump
         fine = edge.reshape(-1)
-        density = self._mesh.texel_per_m[face]
+        density = self._texel_per_m[face]
         fine |= (self._mesh.texture[face] < 0) & (density * range_m.reshape(-1) * pixel_rad > 1)
         return fine & (face >= 0)
 

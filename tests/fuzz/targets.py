@@ -710,8 +710,7 @@ def _glb() -> Target:
     import trimesh
     from PIL import Image
 
-    from instant_ic.geometry.mesh_file import MeshError
-    from instant_ic.vspace.scanned_mesh import load_mesh
+    from instant_ic.geometry.mesh_file import MeshError, load_mesh
 
     logging.getLogger("trimesh").setLevel(logging.CRITICAL)
     box = trimesh.creation.box()

@@ -8,12 +8,13 @@ import pytest
 import trimesh
 from sim_oracles import box_range
 
+from instant_ic.geometry.colour import linear_to_srgb, srgb_to_linear
 from instant_ic.geometry.image_quality import psnr_db
 from instant_ic.geometry.poses import pose_matrix
 from instant_ic.geometry.projections import equirect_directions, perspective_directions
 from instant_ic.sim.building import Building, Finish, Zone
 from instant_ic.sim.render import EquirectRenderer
-from instant_ic.sim.textures import linear_to_srgb, make_texture, pyramid, srgb_to_linear
+from instant_ic.sim.textures import make_texture, pyramid
 from instant_ic.sim.world import Material, World, WorldBuilder
 from instant_ic.sim.worlds import load_world, make_world
 

@@ -5,12 +5,11 @@ import math
 import numpy as np
 import pytest
 
-from instant_ic.geometry.mesh_file import MeshError
+from instant_ic.geometry.mesh_file import MeshError, load_mesh
 from instant_ic.geometry.poses import pose_matrix
 from instant_ic.geometry.projections import equirect_directions
 from instant_ic.vspace import SpaceState, VirtualSpaceConfig
 from instant_ic.vspace.mesh_space import MeshSpace, make_space
-from instant_ic.vspace.scanned_mesh import load_mesh
 from tests import box_room
 
 trimesh = pytest.importorskip("trimesh")
