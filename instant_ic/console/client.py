@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-import contextlib
+import math
 import ssl
 import time
 from collections.abc import Callable
@@ -59,7 +59,7 @@ class ConsoleClient:
         self.refused: list[str] = []
         self.errors: list[str] = []
         self.round_trip_s: float | None = None
-        self._offset_ms: float | None = None
+        self._offset_ms = math.nan  # server's clock minus this one; known from the first pong on
         self._sequence = 0
         self._command = (0.0, 0.0)
         self._http: aiohttp.ClientSession | None = None
@@ -84,33 +84,25 @@ class ConsoleClient:
         """
         self._http = aiohttp.ClientSession()
         parts = urlsplit(self.url)
+        origin = f"{parts.scheme}://{parts.netloc}"
+        headers = {"Origin": origin} | ({"Authorization": f"Bearer {self._token}"} if self._token else {})
         try:
-            self.socket = await asyncio.wait_for(
-                self._http.ws_connect(
-                    f"{'wss' if parts.scheme == 'https' else 'ws'}://{parts.netloc}/ws",
-                    headers={
-                        "Origin": f"{parts.scheme}://{parts.netloc}",
-                        **({"Authorization": f"Bearer {self._token}"} if self._token else {}),
-                    },
-                    ssl=self._ssl,
-                    max_msg_size=32 << 20,
-                ),
-                timeout_s,
-            )
+            async with asyncio.timeout(timeout_s):
+                self.socket = await self._http.ws_connect(
+                    f"{origin}/ws", headers=headers, ssl=self._ssl, max_msg_size=32 << 20
+                )
         except BaseException:
             await self._http.close()
             raise
         self._reader, self.beats = asyncio.create_task(self._read()), asyncio.create_task(self._beat())
-        await self.wait_for(lambda c: c._offset_ms is not None and "hello" in c.messages, timeout_s)
+        await self.wait_for(lambda c: {"hello", "pong"} <= c.messages.keys(), timeout_s)
 
     async def close(self) -> None:
         """Stop and disconnect."""
         tasks = [task for task in (self._reader, self.beats) if task is not None]
         for task in tasks:
             task.cancel()
-        for task in tasks:
-            with contextlib.suppress(asyncio.CancelledError, aiohttp.ClientError, ConnectionError):
-                await task
+        await asyncio.gather(*tasks, return_exceptions=True)
         if self.socket is not None:
             await self.socket.close()
         if self._http is not None:
@@ -164,8 +156,6 @@ class ConsoleClient:
 
     async def send_drive(self, linear: float, angular: float, *, age_s: float = 0.0) -> None:
         """Send one drive command with a stamp ``age_s`` in the past."""
-        if self._offset_ms is None:
-            raise RuntimeError("console client: connect() first")
         self._sequence += 1
         stamp = time.monotonic() * 1000 + self._offset_ms - age_s * 1000
         await self.send(
@@ -174,9 +164,13 @@ class ConsoleClient:
 
     async def send(self, message: dict[str, Any]) -> None:
         """Send a text message."""
+        await self._connected.send_json(message)
+
+    @property
+    def _connected(self) -> aiohttp.ClientWebSocketResponse:
         if self.socket is None:
             raise RuntimeError("console client: connect() first")
-        await self.socket.send_json(message)
+        return self.socket
 
     async def wait_for(self, predicate: Callable[[ConsoleClient], object], timeout_s: float = 10.0) -> None:
         """Wait until ``predicate(self)`` is true; it is checked after each message.
@@ -189,7 +183,7 @@ class ConsoleClient:
             async with asyncio.timeout(timeout_s):
                 async with self._news:
                     while not predicate(self):
-                        if self.socket is None or self.socket.closed:
+                        if self.closed:
                             raise ConnectionError(f"console client: {self.url} closed the connection")
                         await self._news.wait()
         except TimeoutError:
@@ -198,9 +192,8 @@ class ConsoleClient:
             ) from None
 
     async def _read(self) -> None:
-        assert self.socket is not None
         try:
-            async for message in self.socket:
+            async for message in self._connected:
                 if message.type is aiohttp.WSMsgType.BINARY:
                     await self._on_frame(decode_frame(message.data))
                 elif message.type is aiohttp.WSMsgType.TEXT:
@@ -236,10 +229,9 @@ class ConsoleClient:
             self.errors.append(message["text"])
 
     async def _beat(self) -> None:
-        assert self.socket is not None
-        while not self.socket.closed:
+        while not self.closed:
             # Well below the server's drive.beat_timeout_s.
             await self.send({"type": "ping", "client_ms": time.monotonic() * 1000})
-            if self._command != (0.0, 0.0) and self._offset_ms is not None:
+            if self._command != (0.0, 0.0) and "pong" in self.messages:
                 await self.send_drive(*self._command)
             await asyncio.sleep(0.05)
