@@ -9,50 +9,20 @@ from __future__ import annotations
 import dataclasses
 import heapq
 import itertools
-import math
 from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from control_world import (
-    BEAMS,
-    LIDAR_MAX_M,
-    LIDAR_MIN_M,
-    Base,
-    World,
-    corridor,
-    draw_map,
-    matrix,
-    ready_vspace,
-    rectangle,
-)
+from control_world import ready_vspace, rectangle
+from stack_world import START_NS, StackWorld
 
 from instant_ic.bus.lockstep import LockstepBus, Record
 from instant_ic.console.backend import PageServer
 from instant_ic.console.config import ConsoleConfig, ConsoleServerConfig
 from instant_ic.control.states import Mode
-from instant_ic.msg import (
-    ControlState,
-    PoseWithCovariance,
-    PoseWithCovarianceStamped,
-    RenderedView,
-    TFMessage,
-    compressed_image_message,
-    deserialize,
-    grid_message,
-    header,
-    odometry_message,
-    pose_message,
-    scan_message,
-    transform_message,
-    twist_values,
-)
-from nodes.arbiter import ArbiterNode
+from instant_ic.msg import ControlState, RenderedView, compressed_image_message, deserialize, header, twist_values
 from nodes.console import ConsoleNode
-from nodes.navigator import NavigatorNode
-from nodes.virtual_robot import VirtualRobotNode
 
-START_NS = 1_000_000_000_000
 FORWARD, NOTHING = (0.4, 0.0), (0.0, 0.0)
 
 
@@ -82,20 +52,14 @@ class Rates:
     seed: int = 0
 
 
-class RateWorld:
-    """A corridor with boxes, a robot that drives in it, and what the operator sees of it."""
+class RateWorld(StackWorld):
+    """A corridor with boxes, a robot that drives in it, and what the operator sees of it; silent: camera, view, tf."""
 
     def __init__(self, boxes: list[tuple[float, float, float, float]], rates: Rates, length_m: float = 20.0) -> None:
         self.rates = rates
         self.one_image_of = 1  # 5: only each fifth image comes
         self.exposed = 0
         self.rng = np.random.default_rng([17, rates.seed])
-        walls = corridor(length_m)
-        self.world = World(np.concatenate([walls, *(rectangle(*box) for box in boxes)]))
-        self.base = Base()
-        self.contact = False
-        self.silent: set[str] = set()
-        """Of camera, view, tf and operator: does not come any more."""
         self.states: list[ControlState] = []
         self.changes: list[tuple[float, str, str]] = []
         """Each change of mode: when, to which, why."""
@@ -107,20 +71,9 @@ class RateWorld:
         self._rendering = False
         self._request: Any = None
         self._last: dict[str, int] = {}
-        self.bus = LockstepBus(START_NS, keep=False, on_record=self._on_record)
-        for node in (VirtualRobotNode, NavigatorNode):
-            self.bus.add(node)
-        self.arbiter = self.bus.add(ArbiterNode)
+        obstacles = np.concatenate([np.zeros((0, 2, 2)), *(rectangle(*box) for box in boxes)])
+        super().__init__(LockstepBus(START_NS, keep=False, on_record=self._on_record), obstacles, length_m)
         self.console = self.bus.add(ConsoleNode, ConsoleConfig(server=ConsoleServerConfig(port=0)), page=PageServer())
-        static = draw_map(walls, (-2, -1.2, length_m - 2, 1.2))
-        self.bus.publish("/map", grid_message(static.occupancy, 0.05, static.origin, "map", self.now), latched=True)
-        mounts = [("velodyne", 0.6), ("camera", 1.2)]
-        places = []
-        for frame, height_m in mounts:
-            place = np.eye(4)
-            place[2, 3] = height_m
-            places.append(transform_message(place, "base_link", frame, self.now))
-        self.bus.publish("/tf_static", TFMessage(places), latched=True)
         self._every(0.05, self._move)
         self._every(0.05, self._operate)
         self._every(0.1, self._scan, 0.003)
@@ -131,10 +84,6 @@ class RateWorld:
         self.bus.close()
 
     # -- time
-
-    @property
-    def now(self) -> int:
-        return self.bus.clock.now_ns()
 
     @property
     def time_s(self) -> float:
@@ -196,9 +145,8 @@ class RateWorld:
     # -- the world
 
     def _operate(self) -> None:
-        if "operator" not in self.silent:
-            self.console.on_drive(*self.command)
-            self.bus.advance_to(self.now)
+        self.console.on_drive(*self.command)
+        self.bus.advance_to(self.now)
 
     def _late(self, what: str, delay_s: float, do: Callable[[], None]) -> None:
         """Has something come later, but not before what came before it."""
@@ -212,33 +160,23 @@ class RateWorld:
         self._at(when, do)
 
     def _move(self) -> None:
-        self.base.step(self.base_command, 0.05)
-        self.contact |= self.world.contact(self.base.pose)
-        now, map_from_base = self.now, matrix(self.base.pose)
-        frames = [
-            transform_message(np.eye(4), "map", "odom", now),
-            transform_message(map_from_base, "odom", "base_link", now),
-        ]
-        odometry = odometry_message(map_from_base, self.base.v, self.base.w, "odom", "base_link", now)
+        self.drive_base(self.base_command)
+        frames, odometry = self.transforms(), self.odometry()
 
         def send() -> None:
             if "tf" not in self.silent:
-                self.bus.publish("/tf", TFMessage(frames))
+                self.bus.publish("/tf", frames)
             self.bus.publish("/wheel/odom", odometry)
 
         self._late("odometry", self.rates.scan_jitter_s * 0.3 * self.rng.random(), send)
         self.speeds.append((self.time_s, self.base.v))
 
     def _scan(self) -> None:
-        now, pose = self.now, matrix(self.base.pose)
-        ranges = self.world.cast(*self.base.pose)
-        scan = scan_message(ranges, -math.pi, 2 * math.pi / BEAMS, LIDAR_MIN_M, LIDAR_MAX_M, "velodyne", now)
-        covariance = PoseWithCovariance(pose=pose_message(pose), covariance=np.zeros(36))
-        message = PoseWithCovarianceStamped(header=header("map", now), pose=covariance)
+        scan, pose = self.scan(), self.pose()
 
         def send() -> None:
             self.bus.publish("/scan", scan)
-            self.bus.publish("/pose", message)
+            self.bus.publish("/pose", pose)
 
         self._late("scan", 0.01 + self.rates.scan_jitter_s * self.rng.random(), send)
 

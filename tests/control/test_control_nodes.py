@@ -9,18 +9,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from control_world import (
-    BEAMS,
-    LIDAR_MAX_M,
-    LIDAR_MIN_M,
-    Base,
-    World,
-    corridor,
-    draw_map,
-    matrix,
-    ready_vspace,
-    rectangle,
-)
+from control_world import matrix, ready_vspace, rectangle
+from stack_world import START_NS, StackWorld
 
 from instant_ic.bus import OK, WARN
 from instant_ic.bus.lockstep import LockstepBus
@@ -34,26 +24,17 @@ from instant_ic.msg import (
     Bool,
     ControlState,
     PoseIntegrity,
-    PoseWithCovariance,
-    PoseWithCovarianceStamped,
     ShownPictures,
-    TFMessage,
     cloud_message,
     compressed_image_message,
     grid_array,
-    grid_message,
     header,
-    odometry_message,
     pose_message,
-    scan_message,
     to_time,
-    transform_message,
     twist_stamped,
     twist_values,
 )
 from nodes.arbiter import ArbiterNode
-from nodes.navigator import NavigatorNode
-from nodes.virtual_robot import VirtualRobotNode
 
 CONFIG = Path(__file__).resolve().parents[2] / "config" / "control.yaml"
 STEP_NS = 50_000_000
@@ -73,36 +54,18 @@ def test_parameters_that_cannot_be_used_change_nothing(monkeypatch: pytest.Monke
     assert arbiter.parameters.set({"switch.min_real_s": 2.0}) == {"switch.min_real_s": 2.0}
 
 
-class Stack:
-    """The three nodes on a lockstep bus, and a world that answers them at 20 Hz."""
+class Stack(StackWorld):
+    """The three nodes, and a world that answers them at 20 Hz."""
 
     def __init__(self, obstacles: np.ndarray) -> None:
-        walls = corridor()
-        self.world = World(np.concatenate([walls, obstacles]))
-        static = draw_map(walls, (-2, -1.2, 14, 1.2))
-        self.bus = LockstepBus(start_ns=1_000_000_000_000)
-        self.base = Base()
-        for node in (VirtualRobotNode, NavigatorNode):
-            self.bus.add(node)
-        self.arbiter = self.bus.add(ArbiterNode)
-        self.bus.publish("/map", grid_message(static.occupancy, 0.05, static.origin, "map", self.now), latched=True)
-        lidar = np.eye(4)
-        lidar[2, 3] = 0.6
-        mount = transform_message(lidar, "base_link", "velodyne", self.now)
-        self.bus.publish("/tf_static", TFMessage([mount]), latched=True)
-        self.silent: set[str] = set()
+        super().__init__(LockstepBus(START_NS), obstacles)
         self.cloud: np.ndarray | None = None
         """(N, 3) places over ground and height in the world, seen wherever the robot is; None: no 3D points."""
         self.k = 0
-        self.contact = False
         self.page = True
         """Whether the operator has a page, with views of the v-bot two steps old; none comes with "views" in silent."""
         self.picture_ns = self.view_ns = self.lost_ns = 0
         self.views: list[tuple[int, object]] = []
-
-    @property
-    def now(self) -> int:
-        return self.bus.clock.now_ns()
 
     def send(self, topic: str, message: object) -> None:
         if topic not in self.silent:
@@ -123,28 +86,16 @@ class Stack:
 
     def sense(self) -> None:
         """All but the operator's command."""
-        now, map_from_base = self.now, matrix(self.base.pose)
-        if "/tf" not in self.silent:
-            self.bus.publish(
-                "/tf",
-                TFMessage(
-                    [
-                        transform_message(np.eye(4), "map", "odom", now),
-                        transform_message(map_from_base, "odom", "base_link", now),
-                    ]
-                ),
-            )
-        self.send("/wheel/odom", odometry_message(map_from_base, self.base.v, self.base.w, "odom", "base_link", now))
+        now = self.now
+        self.send("/tf", self.transforms())
+        self.send("/wheel/odom", self.odometry())
         if self.k % 2 == 0:
-            ranges = self.world.cast(*self.base.pose)
-            scan = scan_message(ranges, -math.pi, 2 * math.pi / BEAMS, LIDAR_MIN_M, LIDAR_MAX_M, "velodyne", now)
-            self.send("/scan", scan)
-            covariance = PoseWithCovariance(pose=pose_message(map_from_base), covariance=np.zeros(36))
-            self.send("/pose", PoseWithCovarianceStamped(header=header("map", now), pose=covariance))
+            self.send("/scan", self.scan())
+            self.send("/pose", self.pose())
             self.send("/camera/image/compressed", compressed_image_message(b"not a JPEG", "camera", now))
         if self.k % 2 == 0 and self.cloud is not None:
             points = np.zeros(len(self.cloud), POINT_DTYPE)
-            seen = (self.cloud - [*self.base.pose[:2], 0.6]) @ map_from_base[:3, :3]
+            seen = (self.cloud - [*self.base.pose[:2], 0.6]) @ matrix(self.base.pose)[:3, :3]
             points["x"], points["y"], points["z"] = seen.T
             self.send("/lidar/points", cloud_message(points, "velodyne", now))
         if self.k % 10 == 0:
@@ -154,8 +105,7 @@ class Stack:
 
     def move(self) -> None:
         self.k += 1
-        self.base.step(twist_values(self.bus.last("/cmd_vel")), 0.05)
-        self.contact |= self.world.contact(self.base.pose)
+        self.drive_base(twist_values(self.bus.last("/cmd_vel")))
 
     def show(self, now: int) -> None:
         """What the console tells of the pictures that the operator has."""
