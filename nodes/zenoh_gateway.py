@@ -149,7 +149,7 @@ class ZenohGatewayNode(Node[ZenohGatewayConfig]):
     def report(self) -> None:
         if self.session is None:
             return
-        routers, peers = self.session.routers(), self.session.peers()
+        routers, peers = self.session.links()
         if routers or peers:
             self.diagnose("link", OK, f"{routers} routers, {peers} peers")
         else:

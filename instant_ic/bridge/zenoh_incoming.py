@@ -6,7 +6,8 @@ import fnmatch
 import logging
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
 from instant_ic.bridge.commands import COMMANDS, DRIVE, STOP
@@ -50,67 +51,38 @@ def check_subscribe(entries: Sequence[str]) -> None:
             raise ValueError(f"subscribe: {topic} moves a robot; list it under commands, or rename it there")
 
 
+@dataclass(eq=False)
 class _ImportedTopic:
     """An imported topic: a subscription in the ROS graph and a publisher on the bus.
 
-    It receives only from other sessions, so our own messages do not return. Messages of another definition have another
-    key and are not received. A latched subscription requests the last message from each publisher.
-
-    Args:
-        own: the gateway in the ROS graph.
-        topic: name of the topic on the bus.
-        prefix: put before it in the ROS graph.
-        type_name: ``std_msgs/msg/String``.
-        qos: preset of the topic.
-        publisher: publisher on the bus.
-        on_message: called with ``(imported, payload, attachment)``, in order per publisher, on a Zenoh thread.
-
     Attributes:
-        sources: publishers in the ROS graph by session and entity.
-        gone_s: time at which the last of them left; None while there are some, or before the first.
-        count, lost: messages passed on, and messages lost on the way.
-        malformed: messages refused because they have no readable attachment.
+        topic: name of the topic on the bus.
+        type_name: ``std_msgs/msg/String``.
+        publisher: publisher on the bus.
         static: newest static transform of each child frame, if the topic is latched transforms. Several nodes send one
             message each, but our publisher keeps one latched value: their union.
+        declared: subscriber and token in the ROS graph.
+        sources: publishers in the ROS graph by session and entity.
+        gone_s: time at which the last of them left; None while there are some, or before the first.
+        sequences: newest sequence number of each publisher.
+        count, lost: messages passed on, and messages lost on the way.
+        malformed: messages refused because they have no readable attachment.
     """
 
-    def __init__(
-        self,
-        own: RosNode,
-        topic: str,
-        prefix: str,
-        type_name: str,
-        qos: QoS,
-        publisher: Publisher,
-        on_message: Callable[[_ImportedTopic, bytes, Attachment], None],
-    ) -> None:
-        self.topic = topic
-        self.type_name = type_name
-        self.publisher = publisher
-        self.sources: set[tuple[str, int]] = set()
-        self.gone_s: float | None = None
-        self.count = self.lost = self.malformed = 0
-        self.static: dict[str, Any] | None = {} if qos.latched and type_name == _TF else None
-        self._sequences: dict[bytes, int] = {}
-        self._on_message = on_message
-        package, session, hash_ = zenoh(), own.session.zenoh, type_hash(type_name)
-        key = data_key(own.session.domain, prefix + topic, type_name, hash_)
-        remote = package.Locality.REMOTE
-        if qos.latched:
-            self._subscriber = package.ext.declare_advanced_subscriber(
-                session,
-                key,
-                self._heard,
-                allowed_origin=remote,
-                history=package.ext.HistoryConfig(detect_late_publishers=True, max_samples=1),
-                recovery=package.ext.RecoveryConfig(periodic_queries=None, heartbeat=True),
-                subscriber_detection=True,
-            )
-        else:
-            self._subscriber = session.declare_subscriber(key, self._heard, allowed_origin=remote)
-        self._token = own.endpoint("MS", prefix + topic, type_name, hash_, qos)
+    topic: str
+    type_name: str
+    publisher: Publisher
+    static: dict[str, Any] | None
+    declared: tuple[Any, ...] = ()
+    sources: set[tuple[str, int]] = field(default_factory=set)
+    gone_s: float | None = None
+    sequences: dict[bytes, int] = field(default_factory=dict)
+    count: int = 0
+    lost: int = 0
+    malformed: int = 0
 
-    def _heard(self, sample: Any) -> None:
+    def read(self, sample: Any) -> Attachment | None:
+        """Return the attachment of a message and count its publisher's gaps; None for a message to drop."""
         try:
             if sample.attachment is None:
                 raise FormatError("no attachment")
@@ -119,16 +91,16 @@ class _ImportedTopic:
             self.malformed += 1
             if self.malformed == 1:
                 log.error("%s: refused a message not made by rmw_zenoh: %s", self.topic, error)
-            return
-        last = self._sequences.pop(attachment.gid, attachment.sequence - 1)
-        self._sequences[attachment.gid] = max(attachment.sequence, last)
+            return None
+        last = self.sequences.pop(attachment.gid, attachment.sequence - 1)
+        self.sequences[attachment.gid] = max(attachment.sequence, last)
         if attachment.sequence <= last:  # duplicate
-            return
+            return None
         self.lost += attachment.sequence - last - 1
-        if len(self._sequences) > MAX_PUBLISHERS:  # the publisher not heard from for the longest time
-            del self._sequences[next(iter(self._sequences))]
+        if len(self.sequences) > MAX_PUBLISHERS:  # the publisher not heard from for the longest time
+            del self.sequences[next(iter(self.sequences))]
         self.count += 1
-        self._on_message(self, sample.payload.to_bytes(), attachment)
+        return attachment
 
     def merge(self, payload: bytes) -> bytes | memoryview:
         """Return all static transforms so far as one message; other payloads unchanged.
@@ -142,8 +114,8 @@ class _ImportedTopic:
         return serialize(message_type(_TF)(list(self.static.values())))
 
     def close(self) -> None:
-        self._token.undeclare()
-        self._subscriber.undeclare()
+        for each in self.declared:
+            each.undeclare()
 
 
 class Incoming:
@@ -245,15 +217,37 @@ class Incoming:
         imported.gone_s = None
 
     def _open(self, topic: str, type_name: str, qos: QoS) -> _ImportedTopic:
+        """Subscribe in the ROS graph to messages of other sessions; those of another definition have another key."""
         name = message_type(type_name).__msgtype__
         # The gateway itself publishes /heartbeat and the like; other nodes' messages share that publisher.
         publisher = next((p for p in self._node.publishers if p.topic == topic), None)
         if publisher is None:
             publisher = self._node.publisher_raw(topic, name, qos)
-        handle = self._command if topic in self._commands else self._plain
-        imported = _ImportedTopic(self._own, topic, self._prefix, name, qos, publisher, handle)
+        imported = _ImportedTopic(topic, name, publisher, {} if qos.latched and name == _TF else None)
         self._topics[topic] = imported
-        self._node.log.debug("%s is imported as %s", self._prefix + topic, topic)
+        handle = self._command if topic in self._commands else self._plain
+
+        def heard(sample: Any) -> None:
+            """Take a message, in order per publisher, on a Zenoh thread."""
+            if (attachment := imported.read(sample)) is not None:
+                handle(imported, sample.payload.to_bytes(), attachment)
+
+        package, session, there = zenoh(), self._own.session, self._prefix + topic
+        key, remote = data_key(session.domain, there, name, type_hash(name)), package.Locality.REMOTE
+        if qos.latched:  # requests the last message from each publisher
+            subscriber = package.ext.declare_advanced_subscriber(
+                session.zenoh,
+                key,
+                heard,
+                allowed_origin=remote,
+                history=package.ext.HistoryConfig(detect_late_publishers=True, max_samples=1),
+                recovery=package.ext.RecoveryConfig(periodic_queries=None, heartbeat=True),
+                subscriber_detection=True,
+            )
+        else:
+            subscriber = session.zenoh.declare_subscriber(key, heard, allowed_origin=remote)
+        imported.declared = (self._own.endpoint("MS", there, name, type_hash(name), qos), subscriber)
+        self._node.log.debug("%s is imported as %s", there, topic)
         return imported
 
     def _plain(self, imported: _ImportedTopic, payload: bytes, attachment: Attachment) -> None:

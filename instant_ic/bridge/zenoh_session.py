@@ -149,13 +149,9 @@ class RosSession(Closing):
         if not self.zenoh.is_closed():
             self.zenoh.close()
 
-    def routers(self) -> int:
-        """Return the number of connected routers."""
-        return len(self.zenoh.info.routers_zid())
-
-    def peers(self) -> int:
-        """Return the number of connected peers."""
-        return len(self.zenoh.info.peers_zid())
+    def links(self) -> tuple[int, int]:
+        """Return the numbers of connected routers and peers."""
+        return len(self.zenoh.info.routers_zid()), len(self.zenoh.info.peers_zid())
 
     def watch(self, on_token: Callable[[Token, bool], None]) -> None:
         """Call ``on_token(token, alive)`` for current and future entities of other sessions, on a Zenoh thread."""

@@ -258,7 +258,7 @@ def test_latched_values_reach_late_stations_through_access_control(secure, certi
     robot = secure.session("robot", "robot1")
     publisher = RosPublisher(RosNode(robot, "/robot1", "slam"), "/robot1/map", STRING, type_hash(STRING), LATCHED)
     publisher.put(bytes(serialize(String("the map"))), time.time_ns())
-    wait_for(robot.routers, "the router")
+    wait_for(lambda: robot.links()[0], "the router")
     text = with_tls("zenoh_station.json5").replace("/etc/zenoh", str(certificates))
     file = tmp_path_factory.mktemp("c") / "station.json5"
     file.write_text(text.replace("router.example:7447", secure.endpoint))
@@ -298,6 +298,6 @@ def test_without_a_certificate_nobody_gets_in(secure, certificates, tmp_path):
     text = text.replace("/etc/zenoh/ca.pem", str(certificates / "ca.pem"))
     text = "\n".join(line for line in text.splitlines() if "connect_" not in line and "enable_mtls" not in line)
     inside = secure.session("robot", "robot1")
-    wait_for(inside.routers, "the router, for the robot with a certificate")
+    wait_for(lambda: inside.links()[0], "the router, for the robot with a certificate")
     with pytest.raises(ZenohError, match="Unable to connect"):
         RosSession(zenoh.Config.from_json5(text))
