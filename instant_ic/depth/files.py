@@ -1,6 +1,6 @@
 """Images and depth from files.
 
-Depth as PNG of 16 bits (millimetres), ``.npy``, ``.npz`` (key ``depth``) and OpenEXR (all three metres).
+Depth as PNG of 16 bits (millimetres), ``.npy`` and ``.npz`` (key ``depth``), both in metres.
 """
 
 from __future__ import annotations
@@ -12,13 +12,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from instant_ic.util.limits import MOST_FILE_PIXELS, check_arrays, load_image
+from instant_ic.util.limits import check_arrays, load_image
 
-DEPTH_SUFFIXES = (".png", ".npy", ".npz", ".exr")
+DEPTH_SUFFIXES = (".png", ".npy", ".npz")
 PICTURE_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp")
 _BEYOND_M = 1e4
 """Renderers write such values (inf, 1e10) where a ray meets nothing."""
-_EXR_CHANNELS = ("depth", "Depth", "Z", "depth.Z", "ViewLayer.Depth.Z", "V", "depth.V", "Y", "R")
 
 
 class DepthFileError(ValueError):
@@ -56,12 +55,7 @@ def load_depth(path: str | Path, png_unit_m: float = 1e-3) -> NDArray[np.float32
     if kind not in DEPTH_SUFFIXES:
         raise DepthFileError(f"{path}: depth is read from {', '.join(DEPTH_SUFFIXES)}, not {kind or 'a bare name'!r}")
     _check_readable(path)
-    if kind == ".png":
-        values = _png(path, png_unit_m)
-    elif kind == ".exr":
-        values = _exr(path)
-    else:
-        values = _numpy(path)
+    values = _png(path, png_unit_m) if kind == ".png" else _numpy(path)
     values = np.squeeze(values) if values.ndim == 3 and 1 in values.shape else values
     if values.ndim != 2 or min(values.shape) < 2:
         raise DepthFileError(f"{path}: depth must be (H, W) (got {values.shape})")
@@ -114,31 +108,3 @@ def _numpy(path: Path) -> NDArray[Any]:
     if not isinstance(loaded, np.ndarray) or loaded.dtype.kind not in "fiu":
         raise DepthFileError(f"{path}: must hold an array of numbers, metres (got {getattr(loaded, 'dtype', 'none')})")
     return loaded
-
-
-def _exr(path: Path) -> NDArray[Any]:
-    import OpenEXR
-
-    try:
-        with OpenEXR.File(str(path), header_only=True) as file:
-            low, high = (np.asarray(corner, np.int64) for corner in file.header()["dataWindow"])
-        if (pixels := int(np.prod(high - low + 1))) > MOST_FILE_PIXELS:
-            raise DepthFileError(f"{path}: declares {pixels} pixels; {MOST_FILE_PIXELS} at most are read")
-        with OpenEXR.File(str(path), separate_channels=True) as file:
-            channels = {name: np.array(channel.pixels) for name, channel in file.channels().items()}
-    except DepthFileError:
-        raise
-    except (
-        RuntimeError,
-        ValueError,
-        KeyError,
-    ) as error:  # a damaged part is left out, then missing
-        raise DepthFileError(f"{path}: not a readable OpenEXR file: {error}") from error
-    if len(channels) == 1:
-        return next(iter(channels.values()))
-    name = next((n for n in _EXR_CHANNELS if n in channels), None)
-    if name is None:
-        raise DepthFileError(f"{path}: which channel is depth? Has {', '.join(channels)}; name it Z")
-    if name == "R" and not all(np.array_equal(channels["R"], channels.get(c, channels["R"])) for c in "GB"):
-        raise DepthFileError(f"{path}: its channels R, G, B differ: this is an image, not depth")
-    return channels[name]

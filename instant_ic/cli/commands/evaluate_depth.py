@@ -30,8 +30,8 @@ def add_kind(kinds: Any) -> None:
         "Prints JSON. Without --depth there is no comparison: use --plot to see the estimate.",
     ).add_argument  # fmt: skip
     add("images", type=Path, nargs="+", metavar="IMAGES", help="panoramas (2:1): files or folders")
-    text = "true radial depth: files or a folder, same stems as the images; 16-bit PNG in millimetres, .npy, .npz "
-    text += "(key depth) or .exr in metres; 0 = unknown"
+    text = "true radial depth: files or a folder, same stems as the images; 16-bit PNG in millimetres, .npy or "
+    text += ".npz (key depth) in metres; 0 = unknown"
     add("--depth", type=Path, nargs="+", default=[], metavar="GT", help=text)
     add("--model", type=Path, metavar="M", help="ONNX file with its manifest (default: the shipped one)")
     text = "ONNX file of ic depth train, for source completed (default: the shipped one)"

@@ -64,7 +64,7 @@ def _add_train(verbs: Any) -> None:
     add = parser.add_argument
     add("panorama", type=Path, help="equirectangular image, twice as wide as high")
     depth = parser.add_mutually_exclusive_group()
-    text = "its radial depth: 16-bit PNG in mm; .npy, .npz (key depth) or .exr in m; 0 or non-finite is unknown"
+    text = "its radial depth: 16-bit PNG in mm; .npy or .npz (key depth) in m; 0 or non-finite is unknown"
     depth.add_argument("--depth", type=Path, metavar="D", help=text)
     text = "depth model, ONNX or manifest (default: the shipped one; its metres are an estimate, not scaled by a LiDAR)"
     depth.add_argument("--model", type=Path, metavar="M", help=text)
