@@ -351,8 +351,8 @@ class Arbiter:
         if s.mode != Mode.VIRTUAL or s.prediction is None or s.inputs.costmap is None:
             return None
         forward = (s.command[0] or s.inputs.vbot_velocity[0]) >= 0.0
-        config = self.config.subgoal
-        return choose_subgoal(s.inputs.costmap, s.vbot_pose, s.prediction, forward, s.inputs.walls, config)
+        extend_m = self.config.passage.max_pass_m
+        return choose_subgoal(s.inputs.costmap, s.vbot_pose, s.prediction, forward, s.inputs.walls, extend_m)
 
     def _leads_back(self, s: Snapshot) -> bool:
         """Return whether the v-bot returns to the r-bot by itself: nobody drives it, and the r-bot cannot reach it."""

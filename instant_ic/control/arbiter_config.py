@@ -14,7 +14,6 @@ from instant_ic.control.passage import PassageConfig
 from instant_ic.control.planner import PlannerConfig
 from instant_ic.control.prediction import PredictionConfig, stopping_distance
 from instant_ic.control.safety import CollisionMonitorConfig
-from instant_ic.control.subgoal import SubgoalConfig
 
 MOST_BLIND_M = 1.0
 """Longest way at full speed until a source that is lost stops the robot."""
@@ -115,7 +114,6 @@ class ArbiterConfig(Checked):
     collision_monitor: CollisionMonitorConfig = field(default_factory=CollisionMonitorConfig)
     passage: PassageConfig = field(default_factory=PassageConfig)
     planner: PlannerConfig = field(default_factory=PlannerConfig)
-    subgoal: SubgoalConfig = field(default_factory=SubgoalConfig)
     switch: SwitchConfig = field(default_factory=SwitchConfig)
     timeouts: TimeoutConfig = field(default_factory=TimeoutConfig)
     pose_trust: PoseTrustConfig = field(default_factory=PoseTrustConfig)

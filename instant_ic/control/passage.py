@@ -22,7 +22,8 @@ class PassageConfig(Checked):
     """How soon free space must follow behind the obstacle, and how long the detour may be.
 
     Attributes:
-        max_pass_m: m; largest distance behind the obstacle at which free space must begin for a switch to the v-bot.
+        max_pass_m: m; largest distance behind the obstacle at which free space must begin, for a switch to the v-bot
+            and for a subgoal.
         max_detour_m: m; how much longer than straight on the way round may be.
     """
 

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from instant_ic.config.ranges import Checked, NotNegative
 from instant_ic.control.costmap import UNKNOWN, Costmap
 from instant_ic.control.prediction import Prediction
 from instant_ic.control.walls import WallMap
@@ -19,17 +18,6 @@ WALL_CLEARANCE_M = 0.25
 """A search straight on ends where the line comes nearer to a wall than this."""
 _SEARCH_RADIUS_M = 1.5
 """Radius of the search round the v-bot when nothing is free straight on."""
-
-
-@dataclass(frozen=True)
-class SubgoalConfig(Checked):
-    """Search for a free place.
-
-    Attributes:
-        extend_m: m; length searched straight on for a free place behind the obstacle.
-    """
-
-    extend_m: NotNegative = 3.0
 
 
 @dataclass(frozen=True)
@@ -84,9 +72,9 @@ def choose_subgoal(
     prediction: Prediction,
     forward: bool,
     walls: WallMap | None,
-    config: SubgoalConfig,
+    extend_m: float,
 ) -> Subgoal | None:
-    """Return the subgoal for the v-bot's pose (3,) and its predicted trajectory.
+    """Return the subgoal for the v-bot's pose (3,) and its predicted trajectory, at most ``extend_m`` straight on.
 
     The v-bot's pose if free; else the farthest free point of the trajectory; else the first free point straight on
     from its end, before any wall; else the nearest free cell round the v-bot; else None. A free v-bot that is about to
@@ -96,7 +84,7 @@ def choose_subgoal(
     vbot_pose = np.asarray(vbot_pose, dtype=np.float64)
     if _free(costmap, vbot_pose[:2]):
         if prediction.hit_index is not None:
-            behind = _straight_on(costmap, prediction.poses[prediction.hit_index], forward, walls, config.extend_m)
+            behind = _straight_on(costmap, prediction.poses[prediction.hit_index], forward, walls, extend_m)
             if behind is not None:
                 return Subgoal(behind, "ahead")
         return Subgoal(vbot_pose, "vbot")
@@ -104,7 +92,7 @@ def choose_subgoal(
     free = np.flatnonzero(_free(costmap, trajectory[:, :2]))
     if free.size:
         return Subgoal(trajectory[free[-1]], "trajectory")
-    beyond = _straight_on(costmap, trajectory[-1], forward, walls, config.extend_m)
+    beyond = _straight_on(costmap, trajectory[-1], forward, walls, extend_m)
     if beyond is not None:
         return Subgoal(beyond, "ahead")
     rows, columns = np.nonzero(costmap.costs <= MAX_COST)

@@ -28,11 +28,12 @@ from instant_ic.control.heights import sort_points
 from instant_ic.control.kinematics import MotionLimits, accelerate
 from instant_ic.control.moving import MovingPoints, MovingThings
 from instant_ic.control.navigator import Navigator
+from instant_ic.control.passage import PassageConfig
 from instant_ic.control.planner import HybridPlanner, Plan, PlannerConfig
 from instant_ic.control.prediction import PredictionConfig, Predictor
 from instant_ic.control.safety import CollisionMonitor, CollisionMonitorConfig, MonitoredCommand
 from instant_ic.control.static_map import StaticMap
-from instant_ic.control.subgoal import SubgoalConfig, choose_subgoal
+from instant_ic.control.subgoal import choose_subgoal
 from instant_ic.control.vbot import VbotConfig, VirtualRobot
 from instant_ic.control.walls import WallMap
 from instant_ic.control.warmup import warm_up
@@ -196,7 +197,8 @@ class FollowDrive:
         command = self._operator()
         self.vbot.step(command, estimate, DT_S)  # its route avoids the walls
         prediction = self.predictor.predict(self.vbot.pose, self.vbot.velocity, command, self.costmap)
-        subgoal = choose_subgoal(self.costmap, self.vbot.pose, prediction, command[0] >= 0, self.walls, SubgoalConfig())
+        extend_m = PassageConfig().max_pass_m
+        subgoal = choose_subgoal(self.costmap, self.vbot.pose, prediction, command[0] >= 0, self.walls, extend_m)
         wanted = (0.0, 0.0)
         if subgoal is not None:
             velocity = self.vbot.velocity if subgoal.rule == "vbot" else (0.0, 0.0)

@@ -23,7 +23,7 @@ from instant_ic.control.kinematics import MotionLimits
 from instant_ic.control.navigator import Navigator
 from instant_ic.control.planner import HybridPlanner, Plan, PlannerConfig
 from instant_ic.control.prediction import PredictionConfig, Predictor
-from instant_ic.control.subgoal import SubgoalConfig, choose_subgoal
+from instant_ic.control.subgoal import choose_subgoal
 from instant_ic.control.walls import WallMap
 
 PREDICTOR = Predictor(PredictionConfig(), MotionLimits(), Footprint())
@@ -43,11 +43,10 @@ class TestSubgoal:
     box = rectangle(1.5, -0.25, 2.0, 0.25)
     costmap = costmap_of(np.concatenate([corridor(10.0), box]), at=(2.0, 0.0))
 
-    def choose(self, pose: list[float], command: tuple[float, float], **parameters: object) -> object:
+    def choose(self, pose: list[float], command: tuple[float, float], extend_m: float = 3.0) -> object:
         vbot = np.array(pose)
         prediction = PREDICTOR.predict(vbot, command, command, self.costmap)
-        config = SubgoalConfig(**parameters)  # type: ignore[arg-type]
-        return choose_subgoal(self.costmap, vbot, prediction, command[0] >= 0, None, config)
+        return choose_subgoal(self.costmap, vbot, prediction, command[0] >= 0, None, extend_m)
 
     def test_a_free_vbot_is_the_subgoal(self) -> None:
         found = self.choose([0.0, 0.0, 0.1], (0.4, 0.0))
@@ -61,7 +60,7 @@ class TestSubgoal:
         assert 2.9 < found.pose[0] < 3.1
 
     def test_a_vbot_entering_it_sends_the_robot_to_the_first_free_place_behind(self) -> None:
-        found = self.choose([1.3, 0.0, 0.0], (0.1, 0.0), extend_m=3.0)
+        found = self.choose([1.3, 0.0, 0.0], (0.1, 0.0))
         assert found.rule == "ahead"
         # Back face at 2.0 (cell centre 2.025); cost 150 is 0.25 + ln(252/150)/3 = 0.423 m from it.
         assert found.pose[0] == pytest.approx(2.025 + 0.423, abs=0.06)
@@ -77,12 +76,12 @@ class TestSubgoal:
         walls = WallMap(draw_map(np.array([[[1.5, -1.2], [1.5, 1.2]]]), (-2, -1.2, 6, 1.2)))
         vbot = np.array([0.7, 0.0, 0.0])
         prediction = PREDICTOR.predict(vbot, (0.4, 0.0), (0.4, 0.0), self.costmap)
-        assert choose_subgoal(self.costmap, vbot, prediction, True, walls, SubgoalConfig()).rule == "vbot"
+        assert choose_subgoal(self.costmap, vbot, prediction, True, walls, 3.0).rule == "vbot"
 
     def test_nothing_free_is_no_subgoal(self) -> None:
         full = Costmap(np.full((80, 80), LETHAL, np.uint8), 0.05, np.array([-2.0, -2.0]))
         prediction = PREDICTOR.predict(np.zeros(3), (0.0, 0.0), (0.0, 0.0), full)
-        assert choose_subgoal(full, np.zeros(3), prediction, True, None, SubgoalConfig()) is None
+        assert choose_subgoal(full, np.zeros(3), prediction, True, None, 3.0) is None
 
 
 class TestPlanner:
