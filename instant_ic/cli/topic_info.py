@@ -1,62 +1,74 @@
-"""``ic topic info``: publishers and subscribers of a topic, rates, and losses between them."""
+"""``ic topic info`` and ``ic node info``: publishers and subscribers, rates, and losses between them."""
 
 from __future__ import annotations
 
 import argparse
 import math
-from collections.abc import Mapping
 
 from instant_ic.bus import registry
-from instant_ic.bus.heartbeat import Flow, Heartbeat
+from instant_ic.bus.control import ControlError, NodeControl
+from instant_ic.bus.heartbeat import Heartbeat
 from instant_ic.cli.errors import UserError
-from instant_ic.cli.names import absolute, near, topic_types
+from instant_ic.cli.heartbeats import hear
+from instant_ic.cli.names import absolute, find_node, near, topic_types
 from instant_ic.cli.tables import print_table
+from instant_ic.launch.topics import expected_rate
 from instant_ic.util import paths
+
+PUBLISHES, SUBSCRIBES = "publishes", "subscribes"
 
 
 def info(args: argparse.Namespace) -> int:
-    """Print publishers and subscribers; with ``-v`` also QoS, rates and losses."""
+    """Print publishers and subscribers of a topic; with ``-v`` also rates and losses."""
     run_dir = paths.run_dir()
     topic = absolute(args.topic)
     found = next((entry for entry in registry.list_topics(run_dir) if entry.topic == topic), None)
-    publishers = found.publishers if found else []
-    nodes = {node.name: node for node in registry.list_nodes(run_dir)}
-    readers = [node for node in nodes.values() if topic in node.subscribes]
-    if not publishers and not readers:
-        raise UserError(
-            f"{topic}: no node publishes or subscribes to it ({near(topic, topic_types(), 'see ic topic list')})"
-        )
-    beats: Mapping[str, Heartbeat] = {}
+    nodes = registry.list_nodes(run_dir)
+    rows = [(p.node, PUBLISHES, p.type_name, p.qos, str(p.pid)) for p in (found.publishers if found else ())]
+    rows += [(n.name, SUBSCRIBES, n.subscribes[topic], "", str(n.pid)) for n in nodes if topic in n.subscribes]
+    if not rows:
+        hint = near(topic, topic_types(), "see ic topic list")
+        raise UserError(f"{topic}: no node publishes or subscribes to it ({hint})")
+    headings: tuple[str, ...] = ("NODE", "", "TYPE", "QOS", "PID")
     if args.verbose:
-        from instant_ic.cli.heartbeats import hear
-        from instant_ic.launch.topics import expected_rate
-
-        # Commands such as ic topic pub publish too, but have no heartbeat.
-        beats = hear(run_dir, {p.node for p in publishers if p.node in nodes} | {node.name for node in readers})
         if nominal := expected_rate(topic):
-            print(f"Nominal rate: {nominal.rate_hz:g} Hz{f', {nominal.when}' if nominal.when else ''}")
-    print(f"Type: {found.type_name if found else readers[0].subscribes[topic]}")
-    print(f"Publisher count: {len(publishers)}")
-    for publisher in publishers:
-        print(f"  {publisher.node} (pid {publisher.pid}, QoS {publisher.qos}, {publisher.type_name})")
-    print(f"Subscription count: {len(readers)}")
-    for node in readers:
-        print(f"  {node.name} (pid {node.pid}, {node.subscribes[topic]})")
-    if args.verbose:
-        rows = []
-        for publisher in publishers:
-            beat = beats.get(publisher.node)
-            rows.append((publisher.node, "publishes", _rate(beat.outputs.get(topic) if beat else None), ""))
-        for node in readers:
-            beat = beats.get(node.name)
-            lost = beat.lost if beat else {}
-            of = [f"{count} of {name}" for (lost_topic, name), count in sorted(lost.items()) if lost_topic == topic]
-            rows.append((node.name, "subscribes", _rate(beat.inputs.get(topic) if beat else None), ", ".join(of)))
-        print_table(rows, ("NODE", "", "RATE", "LOST"))
+            print(f"nominal rate: {nominal.rate_hz:g} Hz{f', {nominal.when}' if nominal.when else ''}")
+        # Commands such as ic topic pub publish too, but have no heartbeat.
+        beats = hear(run_dir, {row[0] for row in rows} & {node.name for node in nodes})
+        print_table([(*row, *_flow(beats.get(row[0]), row[1], topic)) for row in rows], (*headings, "RATE", "LOST"))
+    else:
+        print_table(rows, headings)
     return 0
 
 
-def _rate(flow: Flow | None) -> str:
-    if flow is None:
-        return "unknown: no heartbeat"
-    return "no message yet" if math.isinf(flow.age_s) else f"{flow.rate_hz:.2f} Hz, newest {flow.age_s:.2f} s ago"
+def show_node(args: argparse.Namespace) -> int:
+    """Print a node's state, process and topics."""
+    node = find_node(args.node)
+    print(f"{node.name}: {node.executable}, pid {node.pid}")
+    beat = hear(paths.run_dir(), [node.name]).get(node.name)
+    if beat is None:
+        print("state: silent, no heartbeat within 2.5 s")
+    else:
+        print(f"state: {beat.state}{f', {beat.message}' if beat.message else ''}")
+        print(f"process: {beat.cpu_percent:.0f} % of a core, {beat.rss_mb:.0f} MB")
+    try:
+        status = NodeControl(paths.run_dir(), node.name, 2.0).status()
+        doing = f", in {status['busy']} for {status['busy_s']:.1f} s" if status["busy_s"] > 0.5 else ""
+        print(f"threads: {status['threads']}{doing}")
+    except ControlError as error:
+        print(f"control: {error}")
+    topics = [(topic, PUBLISHES, kind) for topic, kind in sorted(node.publishes.items())]
+    topics += [(topic, SUBSCRIBES, kind) for topic, kind in sorted(node.subscribes.items())]
+    rows = [(*row, *_flow(beat, row[1], row[0])) for row in topics]
+    print_table(rows, ("TOPIC", "", "TYPE", "RATE", "LOST"))
+    return 0
+
+
+def _flow(beat: Heartbeat | None, role: str, topic: str) -> tuple[str, str]:
+    """Return rate and losses of a topic by a node's heartbeat, as text."""
+    flow = beat and (beat.outputs if role == PUBLISHES else beat.inputs).get(topic)
+    if not beat or not flow:
+        return "unknown", ""
+    rate = "no message yet" if math.isinf(flow.age_s) else f"{flow.rate_hz:.2f} Hz, newest {flow.age_s:.2f} s ago"
+    lost = beat.lost if role == SUBSCRIBES else {}
+    return rate, ", ".join(f"{count} of {name}" for (of, name), count in sorted(lost.items()) if of == topic)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import enum
 import fcntl
+import math
 import os
 import signal
 import subprocess
@@ -25,7 +26,7 @@ MAX_LINE_BYTES = 1 << 16
 """Longer lines of output are split at this length."""
 
 OUTPUT_BYTES_PER_S = 1 << 20
-"""Output limit of a node, after a burst of four seconds' worth; the excess is dropped."""
+"""Output limit of a node, on average over four seconds; the excess is dropped."""
 
 USAGE_STATUS = 2
 """Exit status of a node with wrong parameters or arguments; restarting it cannot help."""
@@ -34,7 +35,6 @@ Schedule = Sequence[tuple[signal.Signals, float]]
 """Signals that end a process, with the wait after each."""
 
 _CHILD = Path(__file__).with_name("child.py")
-_BURST_S = 4.0
 _FLOOD_PAUSE_S = 0.005  # between two reads of output that is dropped: leaves the CPU to the others
 _PIPE_BYTES = 1 << 20  # a short delay of the launcher or its disk must not block the nodes
 
@@ -93,24 +93,24 @@ class RespawnLimit:
 
 
 class OutputLimit:
-    """Passes on what a node writes, up to ``OUTPUT_BYTES_PER_S``; a note stands for what is dropped."""
+    """Passes on ``OUTPUT_BYTES_PER_S`` for each period of a node's output; a note stands for what is dropped."""
+
+    PERIOD_S = 4.0
 
     def __init__(self) -> None:
-        self._budget = _BURST_S * OUTPUT_BYTES_PER_S
-        self._budget_s = time.monotonic()
+        self._left_bytes = 0.0
+        self._period_ends_s = -math.inf
         self._dropped_bytes = 0
 
     def pass_on(self, data: bytes) -> bytes:
         """Return the data, after a note if some was dropped before; empty if it is dropped."""
         now_s = time.monotonic()
-        self._budget += (now_s - self._budget_s) * OUTPUT_BYTES_PER_S
-        self._budget = min(self._budget, _BURST_S * OUTPUT_BYTES_PER_S)
-        self._budget_s = now_s
-        # Once output is dropped, the budget must first recover by one second: one note per second, not per chunk.
-        if self._budget < (OUTPUT_BYTES_PER_S if self._dropped_bytes else 0):
+        if now_s >= self._period_ends_s:
+            self._left_bytes, self._period_ends_s = self.PERIOD_S * OUTPUT_BYTES_PER_S, now_s + self.PERIOD_S
+        if self._left_bytes < 0:
             self._dropped_bytes += len(data)
             return b""
-        self._budget -= len(data)
+        self._left_bytes -= len(data)
         return self.note() + data
 
     def note(self) -> bytes:

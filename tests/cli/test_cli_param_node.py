@@ -101,12 +101,12 @@ def test_dump_and_load(ic, tmp_path):
 def test_node_list_and_info(ic, talker):
     assert ic("node", "list")[:2] == (0, "talker\n")
     assert re.search(r"\ntalker +\d+ +\d+  \S", ic("node", "list", "-v")[1])
-    wait_until(lambda: re.search(r"/scan: .*, [\d.]+ Hz\n", ic("node", "info", "talker")[1]), "a heartbeat with rates")
+    scan = r"/scan +publishes +sensor_msgs/msg/LaserScan +[\d.]+ Hz"
+    wait_until(lambda: re.search(scan, ic("node", "info", "talker")[1]), "a heartbeat with rates")
     status, out, _ = ic("node", "info", "talker")
     assert status == 0 and "state: running\n" in out and re.search(r"process: \d+ % of a core, \d+ MB\n", out)
     assert re.search(r"threads: \d+", out)
-    assert re.search(r"  /scan: sensor_msgs/msg/LaserScan, [\d.]+ Hz\n", out)
-    assert "Subscribers:\n  /order: geometry_msgs/msg/TwistStamped, no message yet" in out
+    assert re.search(r"/order +subscribes +geometry_msgs/msg/TwistStamped +no message yet", out)
     status, _, error = ic("node", "info", "nobody")
     assert status == 1 and "node 'nobody' is not running" in error and "running: talker" in error
 

@@ -53,17 +53,17 @@ def test_type_and_find(ic):
 
 def test_info(ic):
     status, out, _ = ic("topic", "info", "scan")
-    assert status == 0 and "Type: sensor_msgs/msg/LaserScan\nPublisher count: 1\n  talker (pid" in out
-    assert "Publisher count: 0\nSubscription count: 1\n  talker" in ic("topic", "info", "/order")[1]
+    assert status == 0 and re.search(r"talker +publishes +sensor_msgs/msg/LaserScan +sensor +\d+", out)
+    assert re.search(r"talker +subscribes +geometry_msgs/msg/TwistStamped +\d+", ic("topic", "info", "/order")[1])
     status, _, error = ic("topic", "info", "/scam")
     assert status == 1 and "no node publishes or subscribes to it (did you mean '/scan'?)" in error
 
 
 def test_info_verbose_tells_rates_of_the_heartbeat(ic):
-    publisher = r"Nominal rate: 10 Hz\n(?:.*\n)*talker +publishes +([\d.]+) Hz, newest ([\d.]+) s ago"
+    publisher = r"nominal rate: 10 Hz\n(?:.*\n)*talker +publishes +.* +([\d.]+) Hz, newest ([\d.]+) s ago"
     found = wait_until(lambda: re.search(publisher, ic("topic", "info", "-v", "/scan")[1]), "a heartbeat in time")
     assert 0 < float(found[1]) < 60
-    reader = r"talker +subscribes +no message yet"
+    reader = r"talker +subscribes +.* +no message yet"
     wait_until(lambda: re.search(reader, ic("topic", "info", "-v", "/order")[1]), "a heartbeat in time")
 
 

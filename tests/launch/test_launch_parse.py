@@ -327,29 +327,3 @@ def test_same_name_twice_in_one_run_directory_of_a_group(tmp_path: Path, program
     node = "{node: {exec: talker.py}}"
     file = write(tmp_path, f"launch:\n- group: {{run_dir: left, launch: [{node}, {node}]}}\n")
     assert "a node named 'talker' is already started" in problems_of(file)[0]
-
-
-# -- whatever stands in a file -------------------------------------------------------------------
-
-_ACTIONS = ("arg", "let", "node", "include", "group", "set_parameters_from_file", "nothing")
-_KEYS = (
-    *("name", "default", "type", "value", "exec", "param", "from", "to", "remap", "env", "if", "unless", "file", "arg"),
-    *("launch", "run_dir", "respawn", "respawn_delay", "hang_timeout", "filename", "period"),
-)
-_SCALARS = st.one_of(
-    st.sampled_from(["true", "1", "-3", "1.5", "a", "talker.py", "grid_slam", "", "int", "params.yaml", "~"]),
-    st.sampled_from(["$(var a)", "$(eval a == 1)", "$(", "'", "$(run-dir)"]),
-    st.none(),
-    st.text(max_size=8),
-    st.integers(),
-    st.booleans(),
-)
-_BODIES = st.recursive(
-    _SCALARS,
-    lambda inner: st.one_of(
-        st.lists(inner, max_size=3),
-        st.dictionaries(st.sampled_from(_KEYS), inner, max_size=6),
-        st.lists(st.dictionaries(st.sampled_from(_ACTIONS), inner, min_size=1, max_size=1), max_size=3),
-    ),
-    max_leaves=20,
-)
