@@ -1,5 +1,8 @@
 """Chromium, the robot that the pages drive, and pages in which nothing may go wrong."""
 
+import asyncio
+import inspect
+
 import pytest
 from console_pages import (
     CHROMIUM,
@@ -13,10 +16,21 @@ from console_pages import (
     release_by_enter,
     watched_page,
 )
-from console_servers import DRIVE, PATIENT, WATCH, Backend, token_file
+from console_servers import DRIVE, PATIENT, WAIT_S, WATCH, Backend, token_file
 
 from instant_ic.console import ConsoleServer, ConsoleServerConfig
 from instant_ic.console.access import AccessConfig
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_pyfunc_call(pyfuncitem):
+    """Runs a test that is a coroutine."""
+    test = pyfuncitem.obj
+    if not inspect.iscoroutinefunction(test):
+        return None
+    arguments = {name: pyfuncitem.funcargs[name] for name in inspect.signature(test).parameters}
+    asyncio.run(asyncio.wait_for(test(**arguments), 2 * WAIT_S))
+    return True
 
 
 @pytest.fixture

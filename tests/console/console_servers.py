@@ -72,14 +72,6 @@ def token_file(folder, name, token, mode=0o600):
     return str(path)
 
 
-def run(scenario):
-    async def bounded():
-        async with asyncio.timeout(WAIT_S):
-            await scenario()
-
-    asyncio.run(bounded())
-
-
 async def until(condition):
     """Waits for something on the server's side."""
     while not condition():

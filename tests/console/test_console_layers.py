@@ -106,114 +106,102 @@ async def next_layers(client, count):
     return sent_parts(client), client.frames[FrameKind.LAYERS].sequence
 
 
-def test_texts_go_between_the_pieces_of_large_layers_and_one_piece_at_a_time(server):
+async def test_texts_go_between_the_pieces_of_large_layers_and_one_piece_at_a_time(server):
     image = bytes(range(256)) * 1000
     server.send_layers(layers(1, layer(image)))
-
-    async def scenario():
-        url = server.url.replace("http", "ws") + "ws"
-        async with aiohttp.ClientSession() as http, http.ws_connect(url) as socket:
-            collected, parts, pieces = None, Parts(), 0
-            while collected is None:
-                message = await socket.receive(WAIT_S)
-                if message.type is not aiohttp.WSMsgType.BINARY:
-                    continue
-                part = decode_frame(message.data)
-                assert part.kind is FrameKind.PART
-                assert len(part.payload) <= PART_BYTES
-                pieces += 1
-                collected = parts.take(part)
-                for number in range(3):  # the next piece waits for the acknowledgement, pongs do not
-                    await socket.send_json({"type": "ping", "client_ms": number})
-                    while (answer := await socket.receive_json(timeout=WAIT_S))["type"] != "pong":
-                        pass
-                    assert answer["client_ms"] == number
-                await socket.send_json({"type": "ack", "kind": int(FrameKind.PART), "seq": part.sequence})
-            assert pieces == -(-(len(image) + 500) // PART_BYTES)
-            assert collected.kind is FrameKind.LAYERS
-            start, length = collected.header["layers"][0]["parts"]["image"]
-            assert collected.payload[start : start + length] == image
-
-    asyncio.run(scenario())
+    url = server.url.replace("http", "ws") + "ws"
+    async with aiohttp.ClientSession() as http, http.ws_connect(url) as socket:
+        collected, parts, pieces = None, Parts(), 0
+        while collected is None:
+            message = await socket.receive(WAIT_S)
+            if message.type is not aiohttp.WSMsgType.BINARY:
+                continue
+            part = decode_frame(message.data)
+            assert part.kind is FrameKind.PART
+            assert len(part.payload) <= PART_BYTES
+            pieces += 1
+            collected = parts.take(part)
+            for number in range(3):  # the next piece waits for the acknowledgement, pongs do not
+                await socket.send_json({"type": "ping", "client_ms": number})
+                while (answer := await socket.receive_json(timeout=WAIT_S))["type"] != "pong":
+                    pass
+                assert answer["client_ms"] == number
+            await socket.send_json({"type": "ack", "kind": int(FrameKind.PART), "seq": part.sequence})
+        assert pieces == -(-(len(image) + 500) // PART_BYTES)
+        assert collected.kind is FrameKind.LAYERS
+        start, length = collected.header["layers"][0]["parts"]["image"]
+        assert collected.payload[start : start + length] == image
 
 
-def test_each_page_gets_a_version_once_and_only_what_it_lacks(server):
+async def test_each_page_gets_a_version_once_and_only_what_it_lacks(server):
     camera, guess = layer(b"camera"), layer(b"guess")
     server.send_layers(layers(1, camera, guess))
+    async with ConsoleClient(server.url, acknowledge=False) as page:
 
-    async def scenario():
-        async with ConsoleClient(server.url, acknowledge=False) as page:
+        async def acknowledge(number, **values):
+            await page.send({"type": "ack", "kind": 5, "seq": number, **values})
 
-            async def acknowledge(number, **values):
-                await page.send({"type": "ack", "kind": 5, "seq": number, **values})
-
-            found, number = await next_layers(page, 1)  # it came later than the layers
-            assert found == (1, [True, True])
-            for version in (2, 3):
-                server.send_layers(layers(version, camera, layer(b"better")))
-            await page.send({"type": "ping", "client_ms": 0})
-            await asyncio.sleep(0.1)
-            assert page.frame_counts[FrameKind.LAYERS] == 1  # never more than one on the way
-            await acknowledge(number)
-            found, number = await next_layers(page, 2)
-            assert found == (3, [False, True])  # the newest, and of it what changed
-            await acknowledge(number, loaded=False)
-            server.send_layers(layers(4, camera, layer(b"best")))
-            found, number = await next_layers(page, 3)
-            assert found == (4, [True, True])  # it could not load the ones before
-            await acknowledge(number, loaded="yes")
-            await page.wait_for(lambda c: c.errors, WAIT_S)
-            assert "ack.loaded must be true or false" in page.errors[0]
-
-    asyncio.run(scenario())
+        found, number = await next_layers(page, 1)  # it came later than the layers
+        assert found == (1, [True, True])
+        for version in (2, 3):
+            server.send_layers(layers(version, camera, layer(b"better")))
+        await page.send({"type": "ping", "client_ms": 0})
+        await asyncio.sleep(0.1)
+        assert page.frame_counts[FrameKind.LAYERS] == 1  # never more than one on the way
+        await acknowledge(number)
+        found, number = await next_layers(page, 2)
+        assert found == (3, [False, True])  # the newest, and of it what changed
+        await acknowledge(number, loaded=False)
+        server.send_layers(layers(4, camera, layer(b"best")))
+        found, number = await next_layers(page, 3)
+        assert found == (4, [True, True])  # it could not load the ones before
+        await acknowledge(number, loaded="yes")
+        await page.wait_for(lambda c: c.errors, WAIT_S)
+        assert "ack.loaded must be true or false" in page.errors[0]
 
 
-def test_views_are_needed_unless_every_page_renders_the_newest_layers_by_itself(server, monkeypatch):
+async def test_views_are_needed_unless_every_page_renders_the_newest_layers_by_itself(server, monkeypatch):
     server.send_layers(layers(5))
     news = []
     server.backend.on_drawn = lambda: news.append(server.drawn_ms())
+    async with ConsoleClient(server.url) as driver, ConsoleClient(server.url) as watcher:
+        await driver.acquire()
+        await until(lambda: FrameKind.LAYERS in driver.frames)
+        assert server.needs_views()
+        assert server.drawn_ms() is None
 
-    async def scenario():
-        async with ConsoleClient(server.url) as driver, ConsoleClient(server.url) as watcher:
-            await driver.acquire()
-            await until(lambda: FrameKind.LAYERS in driver.frames)
-            assert server.needs_views()
-            assert server.drawn_ms() is None
+        async def drawn(page, version, state_ms):
+            await page.send({"type": "drawn", "version": version, "state_ms": state_ms})
 
-            async def drawn(page, version, state_ms):
-                await page.send({"type": "drawn", "version": version, "state_ms": state_ms})
-
-            now_ms = server.now_ms()
-            await drawn(driver, 5, now_ms - 30)
-            await until(lambda: server.drawn_ms() == now_ms - 30)
-            assert news == [now_ms - 30]
-            assert server.needs_views()  # the watcher's page does not
-            server.send_frame(FrameKind.VIEW, {"n": 1}, b"view")
-            await watcher.wait_for(lambda c: FrameKind.VIEW in c.frames, WAIT_S)
-            assert FrameKind.VIEW not in driver.frames
-            await drawn(watcher, 5, now_ms)
-            await until(lambda: not server.needs_views())
-            assert server.drawn_ms() == now_ms - 30  # the driver's counts
-            # What the page shows of outdated layers, or of those of another server, is no news.
-            monkeypatch.setattr(pages_module, "SUPERSEDED_S", 0.05)
-            server.send_layers(layers(6))
-            await asyncio.sleep(0.3)
-            for version in (5, 99):
-                await drawn(driver, version, now_ms)
-            await drawn(driver, 6, now_ms + 1)
-            await until(lambda: server.drawn_ms() == now_ms + 1)
-            assert news == [now_ms - 30, now_ms + 1]
-            await drawn(driver, 0, now_ms + 2)
-            await until(server.needs_views)
-            assert server.drawn_ms() is None
-            await drawn(driver, 99, now_ms + 3)
-            await until(lambda: server.drawn_ms() == 0.0)  # as old as can be: a view that is stale
-            for bad in ({"version": -1, "state_ms": 0}, {"version": 6, "state_ms": now_ms + 1e7}, {"version": 6}):
-                await driver.send({"type": "drawn", **bad})
-            await driver.wait_for(lambda c: len(c.errors) == 3, WAIT_S)
-        await until(lambda: server.drawn_ms() is None)
-
-    asyncio.run(scenario())
+        now_ms = server.now_ms()
+        await drawn(driver, 5, now_ms - 30)
+        await until(lambda: server.drawn_ms() == now_ms - 30)
+        assert news == [now_ms - 30]
+        assert server.needs_views()  # the watcher's page does not
+        server.send_frame(FrameKind.VIEW, {"n": 1}, b"view")
+        await watcher.wait_for(lambda c: FrameKind.VIEW in c.frames, WAIT_S)
+        assert FrameKind.VIEW not in driver.frames
+        await drawn(watcher, 5, now_ms)
+        await until(lambda: not server.needs_views())
+        assert server.drawn_ms() == now_ms - 30  # the driver's counts
+        # What the page shows of outdated layers, or of those of another server, is no news.
+        monkeypatch.setattr(pages_module, "SUPERSEDED_S", 0.05)
+        server.send_layers(layers(6))
+        await asyncio.sleep(0.3)
+        for version in (5, 99):
+            await drawn(driver, version, now_ms)
+        await drawn(driver, 6, now_ms + 1)
+        await until(lambda: server.drawn_ms() == now_ms + 1)
+        assert news == [now_ms - 30, now_ms + 1]
+        await drawn(driver, 0, now_ms + 2)
+        await until(server.needs_views)
+        assert server.drawn_ms() is None
+        await drawn(driver, 99, now_ms + 3)
+        await until(lambda: server.drawn_ms() == 0.0)  # as old as can be: a view that is stale
+        for bad in ({"version": -1, "state_ms": 0}, {"version": 6, "state_ms": now_ms + 1e7}, {"version": 6}):
+            await driver.send({"type": "drawn", **bad})
+        await driver.wait_for(lambda c: len(c.errors) == 3, WAIT_S)
+    await until(lambda: server.drawn_ms() is None)
 
 
 def encoded(number, kind=Kind.SEEN, gain=(1.0, 1.0, 1.0)):

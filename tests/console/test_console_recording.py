@@ -119,26 +119,22 @@ def test_the_recorder_is_asked_over_its_control_channel(node, tmp_path, monkeypa
 # ---- the server ------------------------------------------------------------------------------------
 
 
-def test_drivers_record_and_watchers_may_not(serve, files):
+async def test_drivers_record_and_watchers_may_not(serve, files):
     server = serve(access=files)
-
-    async def scenario():
-        async with (
-            ConsoleClient(server.url, token=DRIVE) as driver,
-            ConsoleClient(server.url, token=WATCH) as watcher,
-        ):
-            for message in ({"type": "record", "on": True}, {"type": "snapshot"}, {"type": "bookmark"}):
-                await watcher.send(message)
-            await watcher.wait_for(lambda c: c.refused == ["watch_only"] * 3, WAIT_S)
-            assert server.backend.recorder == []
-            await driver.send({"type": "record", "on": True})
-            await driver.send({"type": "snapshot"})
-            await driver.send({"type": "bookmark"})
-            await driver.send({"type": "record", "on": False})
-            await asyncio.to_thread(server.backend.wait, lambda b: len(b.recorder) == 4)
-            assert server.backend.recorder == [("record", True), ("snapshot",), ("bookmark",), ("record", False)]
-            for bad in ({"type": "record"}, {"type": "record", "on": 1}):
-                await driver.send(bad)
-            await driver.wait_for(lambda c: len(c.errors) == 2, WAIT_S)
-
-    asyncio.run(scenario())
+    async with (
+        ConsoleClient(server.url, token=DRIVE) as driver,
+        ConsoleClient(server.url, token=WATCH) as watcher,
+    ):
+        for message in ({"type": "record", "on": True}, {"type": "snapshot"}, {"type": "bookmark"}):
+            await watcher.send(message)
+        await watcher.wait_for(lambda c: c.refused == ["watch_only"] * 3, WAIT_S)
+        assert server.backend.recorder == []
+        await driver.send({"type": "record", "on": True})
+        await driver.send({"type": "snapshot"})
+        await driver.send({"type": "bookmark"})
+        await driver.send({"type": "record", "on": False})
+        await asyncio.to_thread(server.backend.wait, lambda b: len(b.recorder) == 4)
+        assert server.backend.recorder == [("record", True), ("snapshot",), ("bookmark",), ("record", False)]
+        for bad in ({"type": "record"}, {"type": "record", "on": 1}):
+            await driver.send(bad)
+        await driver.wait_for(lambda c: len(c.errors) == 2, WAIT_S)

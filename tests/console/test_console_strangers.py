@@ -15,7 +15,7 @@ from types import SimpleNamespace
 import aiohttp
 import pytest
 from aiohttp import WSMsgType
-from console_servers import DRIVE, WAIT_S, WATCH, run, token_file, until
+from console_servers import DRIVE, WAIT_S, WATCH, token_file, until
 from test_console_access import certificate
 
 from instant_ic.bus.clock import ManualClock
@@ -103,148 +103,118 @@ def test_a_token_bucket_lets_its_rate_through():
     ],
     ids=["pings", "protocol pings", "endless fragments"],
 )
-def test_fault_a_flood_closes_its_own_socket_with_a_reason_and_no_other(serve, flood, messages, caplog):
+async def test_fault_a_flood_closes_its_own_socket_with_a_reason_and_no_other(serve, flood, messages, caplog):
     server = serve(max_messages_per_s=100.0)
-
-    async def scenario():
-        async with ConsoleClient(server.url) as driver:
-            await driver.acquire()
-            reader, writer = await raw_socket(server)
-            replies = asyncio.create_task(count_replies(reader))
-            if not messages:
-                writer.write(frame(b"", TEXT, fin=False))
-            while not replies.done():
-                writer.write(flood)
-                with contextlib.suppress(TimeoutError, ConnectionError):
-                    await asyncio.wait_for(writer.drain(), 0.01)
-                await asyncio.sleep(0)
-            pongs, closed = await replies
-            if closed is None:  # what still comes in after the close resets the connection: the frame may be lost
-                assert "sends too many messages" in caplog.text
-            else:
-                assert closed[0] == 1008
-                assert closed[1] == "too many messages"
-            if messages:
-                assert pongs <= 200 + 100 * WAIT_S  # 2 s of them at once, then the rate
-            writer.close()
-            await driver.wait_for(lambda c: c.session["clients"] == 1)
-            assert driver.session["driver"] == "you" and not driver.closed
-
-    run(scenario)
-
-
-def test_the_message_that_is_one_too_many_still_stops_the_robot(serve):
-    server = serve(max_messages_per_s=1.0)
-
-    async def scenario():
+    async with ConsoleClient(server.url) as driver:
+        await driver.acquire()
         reader, writer = await raw_socket(server)
-        writer.write(frame(b'{"type":"estop"}') * 100)
-        _, closed = await count_replies(reader)
-        assert closed == (1008, "too many messages")
+        replies = asyncio.create_task(count_replies(reader))
+        if not messages:
+            writer.write(frame(b"", TEXT, fin=False))
+        while not replies.done():
+            writer.write(flood)
+            with contextlib.suppress(TimeoutError, ConnectionError):
+                await asyncio.wait_for(writer.drain(), 0.01)
+            await asyncio.sleep(0)
+        pongs, closed = await replies
+        if closed is None:  # what still comes in after the close resets the connection: the frame may be lost
+            assert "sends too many messages" in caplog.text
+        else:
+            assert closed[0] == 1008
+            assert closed[1] == "too many messages"
+        if messages:
+            assert pongs <= 200 + 100 * WAIT_S  # 2 s of them at once, then the rate
         writer.close()
+        await driver.wait_for(lambda c: c.session["clients"] == 1)
+        assert driver.session["driver"] == "you" and not driver.closed
 
-    run(scenario)
+
+async def test_the_message_that_is_one_too_many_still_stops_the_robot(serve):
+    server = serve(max_messages_per_s=1.0)
+    reader, writer = await raw_socket(server)
+    writer.write(frame(b'{"type":"estop"}') * 100)
+    _, closed = await count_replies(reader)
+    assert closed == (1008, "too many messages")
+    writer.close()
     assert server.backend.estops == [True]
 
 
-def test_fault_an_emergency_stop_waits_behind_other_clients_messages(serve):
+async def test_fault_an_emergency_stop_waits_behind_other_clients_messages(serve):
     """Each client has one message a turn: between stop and topic comes one of each flooder, not its queue."""
     server = serve(max_messages_per_s=1e6)
-    handled, at_the_stop = Counter(), []
-    handle, on_estop = server.pages.handle, server.backend.on_estop
+    handled, at_the_stop, loops = Counter(), [], []
+    handle = server.pages.handle
     server.pages.handle = lambda session, message, now: (
         handled.update([session.number]),
         handle(session, message, now),
     )
-    asked, loops = asyncio.Event(), []
     server.backend.on_watched = lambda _: loops.append(asyncio.get_running_loop())
-
-    def stop(stopped):
-        at_the_stop.append(handled.copy())
-        on_estop(stopped)
-
-    server.backend.on_estop = stop
-
-    async def scenario():
-        flooders = [await raw_socket(server, ELSEWHERE) for _ in range(5)]
-        watcher, stopper = await raw_socket(server)
-        await until(lambda: len(server.pages.sessions) == 6)
-        number = max(server.pages.sessions)
-        # On the server's own thread: its turns stand still until all bytes lie in the sockets.
-        gate = asyncio.run_coroutine_threadsafe(hold(), loops[0])
-        await asked.wait()
-        for _, writer in flooders:
-            writer.write(frame(PING) * 1000)
-            await writer.drain()
-        stopper.write(frame(b'{"type":"estop"}'))
-        await stopper.drain()
-        release.set()
-        await asyncio.wrap_future(gate)
-        await until(lambda: at_the_stop)
-        others = [count for client, count in at_the_stop[0].items() if client != number]
-        assert sum(others) <= 5 * 3  # of 5000
-        for _, writer in [*flooders, (watcher, stopper)]:
-            writer.close()
-
-    release, loop_holder = threading.Event(), []
+    server.backend.on_estop = lambda stopped: at_the_stop.append(handled.copy())
+    held, release, here = asyncio.Event(), threading.Event(), asyncio.get_running_loop()
 
     async def hold():
-        loop_holder[0].call_soon_threadsafe(asked.set)
+        here.call_soon_threadsafe(held.set)
         assert release.wait(WAIT_S)
 
-    async def with_loop():
-        loop_holder.append(asyncio.get_running_loop())
-        await scenario()
+    flooders = [await raw_socket(server, ELSEWHERE) for _ in range(5)]
+    watcher, stopper = await raw_socket(server)
+    await until(lambda: len(server.pages.sessions) == 6)
+    number = max(server.pages.sessions)
+    # On the server's own thread: its turns stand still until all bytes lie in the sockets.
+    gate = asyncio.run_coroutine_threadsafe(hold(), loops[0])
+    await held.wait()
+    for _, writer in flooders:
+        writer.write(frame(PING) * 1000)
+        await writer.drain()
+    stopper.write(frame(b'{"type":"estop"}'))
+    await stopper.drain()
+    release.set()
+    await asyncio.wrap_future(gate)
+    await until(lambda: at_the_stop)
+    others = [count for client, count in at_the_stop[0].items() if client != number]
+    assert sum(others) <= 5 * 3  # of 5000
+    assert len(at_the_stop) == 1
+    for _, writer in [*flooders, (watcher, stopper)]:
+        writer.close()
 
-    run(with_loop)
-    assert server.backend.estops == [True]
 
-
-def test_an_emergency_stop_comes_by_a_connection_of_its_own(serve):
+async def test_an_emergency_stop_comes_by_a_connection_of_its_own(serve):
     server = serve()
-
-    async def scenario():
-        async with ConsoleClient(server.url) as driver, aiohttp.ClientSession() as http:
-            await driver.acquire()
-            async with http.post(server.url + "estop", headers={"Origin": "http://evil.example"}) as response:
-                assert response.status == 403
-            host = f"evil.example:{server.port}"
-            async with http.post(server.url + "estop", headers={"Host": host, "Origin": f"http://{host}"}) as response:
-                assert response.status == 403
-            assert server.backend.estops == []
-            async with http.post(server.url + "estop", headers={"Origin": server.url.rstrip("/")}) as response:
-                assert response.status == 204
-            await driver.wait_for(lambda c: c.session["estop"])
-
-    run(scenario)
+    async with ConsoleClient(server.url) as driver, aiohttp.ClientSession() as http:
+        await driver.acquire()
+        async with http.post(server.url + "estop", headers={"Origin": "http://evil.example"}) as response:
+            assert response.status == 403
+        host = f"evil.example:{server.port}"
+        async with http.post(server.url + "estop", headers={"Host": host, "Origin": f"http://{host}"}) as response:
+            assert response.status == 403
+        assert server.backend.estops == []
+        async with http.post(server.url + "estop", headers={"Origin": server.url.rstrip("/")}) as response:
+            assert response.status == 204
+        await driver.wait_for(lambda c: c.session["estop"])
     assert server.backend.estops == [True]
 
 
-def test_fault_a_client_that_does_not_read_grows_the_servers_memory(serve, monkeypatch):
+async def test_fault_a_client_that_does_not_read_grows_the_servers_memory(serve, monkeypatch):
     for limit in ("BYTES_PER_S", "BURST_BYTES"):  # which would close it before
         monkeypatch.setattr(connections_module, limit, 1e9)
     server = serve(max_messages_per_s=1e6)
-
-    async def scenario():
-        async with ConsoleClient(server.url) as driver:
-            await driver.acquire()
-            _, writer = await raw_socket(server)  # reads nothing from here on
-            await until(lambda: len(server.pages.sessions) == 2)
-            session = server.pages.sessions[max(server.pages.sessions)]
-            while session.number in server.pages.sessions:
-                server.send_frame(FrameKind.PANORAMA, {}, bytes(200_000))
-                writer.write(frame(PING) * 100)
-                with contextlib.suppress(TimeoutError, ConnectionError):
-                    await asyncio.wait_for(writer.drain(), 0.01)
-            assert session.chokes or session.connection.transport is None  # its replies are bounded
-            await until(lambda: session.connection.transport is None)  # cut off although it takes no closing frame
-            writer.close()
-            await driver.wait_for(lambda c: c.session["clients"] == 1)
-
-    run(scenario)
+    async with ConsoleClient(server.url) as driver:
+        await driver.acquire()
+        _, writer = await raw_socket(server)  # reads nothing from here on
+        await until(lambda: len(server.pages.sessions) == 2)
+        session = server.pages.sessions[max(server.pages.sessions)]
+        while session.number in server.pages.sessions:
+            server.send_frame(FrameKind.PANORAMA, {}, bytes(200_000))
+            writer.write(frame(PING) * 100)
+            with contextlib.suppress(TimeoutError, ConnectionError):
+                await asyncio.wait_for(writer.drain(), 0.01)
+        assert session.chokes or session.connection.transport is None  # its replies are bounded
+        await until(lambda: session.connection.transport is None)  # cut off although it takes no closing frame
+        writer.close()
+        await driver.wait_for(lambda c: c.session["clients"] == 1)
 
 
-def test_fault_requests_whose_clients_have_left_wait_for_ever(serve, monkeypatch):
+async def test_fault_requests_whose_clients_have_left_wait_for_ever(serve, monkeypatch):
     """The limits count connections; a client that opens and closes them could leave any number of waiting requests."""
     asked = Counter()
 
@@ -258,20 +228,16 @@ def test_fault_requests_whose_clients_have_left_wait_for_ever(serve, monkeypatch
 
     monkeypatch.setattr("instant_ic.console.server.AddressBuckets", lambda *_: SimpleNamespace(of=lambda _: Full()))
     server = serve()
-
-    async def scenario():
-        for _ in range(5):
-            before = asked["waiting"]
-            _, writer = await asyncio.open_connection("127.0.0.1", server.port)
-            writer.write(b"GET /ws HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n")
-            await until(lambda before=before: asked["waiting"] > before)
-            writer.close()
-        before = -1
-        while asked["waiting"] > before:  # nobody asks any more
-            before = asked["waiting"]
-            await asyncio.sleep(0.2)
-
-    run(scenario)
+    for _ in range(5):
+        before = asked["waiting"]
+        _, writer = await asyncio.open_connection("127.0.0.1", server.port)
+        writer.write(b"GET /ws HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n")
+        await until(lambda before=before: asked["waiting"] > before)
+        writer.close()
+    before = -1
+    while asked["waiting"] > before:  # nobody asks any more
+        before = asked["waiting"]
+        await asyncio.sleep(0.2)
 
 
 # ---- connections -------------------------------------------------------------------------------------
@@ -305,33 +271,29 @@ def test_networks_of_addresses():
 
 
 @pytest.mark.parametrize("sent", [b"", b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\n"], ids=["idle", "half-open"])
-def test_fault_idle_connections_starve_the_driver(serve, sent):
+async def test_fault_idle_connections_starve_the_driver(serve, sent):
     server = serve(max_connections=20, max_connections_per_address=10)
-
-    async def scenario():
-        held = []
-        for local in [ELSEWHERE] * 30 + [("127.0.0.3", 0)] * 15:
-            reader, writer = await asyncio.open_connection("127.0.0.1", server.port, local_addr=local)
-            writer.write(sent)
-            held.append((reader, writer))
-        async with ConsoleClient(server.url) as driver:
-            await driver.acquire()
-            listener = server.listener
-            assert len(listener.admitted) <= 20
-            counts = Counter(connection.network for connection in listener.admitted)
-            assert max(counts.values()) <= 10
-            # The address that holds them still gets in itself, by its oldest.
-            async with aiohttp.ClientSession(connector=aiohttp.TCPConnector(local_addr=ELSEWHERE)) as http:
-                async with http.get(server.url + "health") as response:
-                    assert response.status == 200
-            assert not driver.closed
-        for _, writer in held:
-            writer.close()
-
-    run(scenario)
+    held = []
+    for local in [ELSEWHERE] * 30 + [("127.0.0.3", 0)] * 15:
+        reader, writer = await asyncio.open_connection("127.0.0.1", server.port, local_addr=local)
+        writer.write(sent)
+        held.append((reader, writer))
+    async with ConsoleClient(server.url) as driver:
+        await driver.acquire()
+        listener = server.listener
+        assert len(listener.admitted) <= 20
+        counts = Counter(connection.network for connection in listener.admitted)
+        assert max(counts.values()) <= 10
+        # The address that holds them still gets in itself, by its oldest.
+        async with aiohttp.ClientSession(connector=aiohttp.TCPConnector(local_addr=ELSEWHERE)) as http:
+            async with http.get(server.url + "health") as response:
+                assert response.status == 200
+        assert not driver.closed
+    for _, writer in held:
+        writer.close()
 
 
-def test_fault_headers_bodies_and_handshakes_take_for_ever(serve, monkeypatch, tmp_path):
+async def test_fault_headers_bodies_and_handshakes_take_for_ever(serve, monkeypatch, tmp_path):
     monkeypatch.setattr(connections_module, "HEADERS_S", 0.3)
     monkeypatch.setattr("instant_ic.console.server.HEADERS_S", 0.3)
     server = serve(access={"token_file": token_file(tmp_path, "drive", DRIVE)})
@@ -348,56 +310,41 @@ def test_fault_headers_bodies_and_handshakes_take_for_ever(serve, monkeypatch, t
         writer.close()
         return await answer
 
-    async def scenario():
-        assert await trickle(b"GET / HTTP/1.1\r\nX-Slow: ", b"x") == b""
-        assert await trickle(b"", b"") == b""
-        assert b" 408 " in await trickle(slow + b"Content-Length: 4000\r\n\r\n", b"x")
-
-    run(scenario)
+    assert await trickle(b"GET / HTTP/1.1\r\nX-Slow: ", b"x") == b""
+    assert await trickle(b"", b"") == b""
+    assert b" 408 " in await trickle(slow + b"Content-Length: 4000\r\n\r\n", b"x")
 
 
-def test_fault_a_tls_handshake_takes_for_ever(serve, monkeypatch, certificate):
+async def test_fault_a_tls_handshake_takes_for_ever(serve, monkeypatch, certificate):
     monkeypatch.setattr(connections_module, "HEADERS_S", 0.5)
     server = serve(access=certificate)
-
-    async def scenario():
-        reader, writer = await asyncio.open_connection("127.0.0.1", server.port)
-        assert await reader.read() == b""
-        writer.close()
-        await until(lambda: not server.listener.admitted)
-
-    run(scenario)
+    reader, writer = await asyncio.open_connection("127.0.0.1", server.port)
+    assert await reader.read() == b""
+    writer.close()
+    await until(lambda: not server.listener.admitted)
 
 
-def test_a_page_that_may_only_watch_leaves_places_for_drivers(serve, files):
+async def test_a_page_that_may_only_watch_leaves_places_for_drivers(serve, files):
     server = serve(max_clients=4, access=files)
-
-    async def scenario():
-        async with ConsoleClient(server.url, token=WATCH), ConsoleClient(server.url, token=WATCH):
-            with pytest.raises(aiohttp.WSServerHandshakeError) as refused:
-                await ConsoleClient(server.url, token=WATCH).connect()
-            assert refused.value.status == 503
-            async with ConsoleClient(server.url, token=DRIVE) as driver:
-                await driver.acquire()
-
-    run(scenario)
+    async with ConsoleClient(server.url, token=WATCH), ConsoleClient(server.url, token=WATCH):
+        with pytest.raises(aiohttp.WSServerHandshakeError) as refused:
+            await ConsoleClient(server.url, token=WATCH).connect()
+        assert refused.value.status == 503
+        async with ConsoleClient(server.url, token=DRIVE) as driver:
+            await driver.acquire()
 
 
-def test_more_connections_a_second_than_a_page_needs_are_refused_without_a_log_flood(serve, monkeypatch, caplog):
+async def test_more_connections_a_second_than_a_page_needs_are_refused_without_a_log_flood(serve, monkeypatch, caplog):
     monkeypatch.setattr(connections_module, "BURST_CONNECTIONS", 5.0)
     monkeypatch.setattr(connections_module, "CONNECTIONS_PER_S", 0.001)
     server = serve()
-
-    async def scenario():
+    with caplog.at_level(logging.WARNING):
         for _ in range(50):
             _, writer = await asyncio.open_connection("127.0.0.1", server.port, local_addr=ELSEWHERE)
             writer.write(b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n")
         await until(lambda: server.listener.refused == 45)
         async with ConsoleClient(server.url) as driver:  # from another address
             await driver.acquire()
-
-    with caplog.at_level(logging.WARNING):
-        run(scenario)
     # How many seconds it took, the machine decides: once a second, and 45 at once are one line.
     assert 1 <= sum("refused a connection from 127.0.0.2" in line for line in caplog.messages) < 45
 
@@ -412,7 +359,7 @@ STRANGERS = {
 
 
 @pytest.mark.parametrize(("sent", "tls"), [("wrong token", False), ("none", True), ("half", False), ("nothing", True)])
-def test_fault_a_right_stop_is_refused_because_of_strangers_at_its_address(
+async def test_fault_a_right_stop_is_refused_because_of_strangers_at_its_address(
     serve, monkeypatch, tmp_path, certificate, sent, tls
 ):
     """Whoever else is behind the same router, or a user of the same machine, opens 15 connections to each stop."""
@@ -437,26 +384,23 @@ def test_fault_a_right_stop_is_refused_because_of_strangers_at_its_address(
             async with http.request(method, server.url + path, **given) as response:
                 return response.status, response.headers.get("Set-Cookie", "").partition(";")[0]
 
-    async def scenario():
-        held = []
-        entered, cookie = await answer(("GET", f"?token={DRIVE}", {}))
-        assert entered == 303
-        ways = {"Authorization": f"bearer  {DRIVE}"}, {"Cookie": f"other=1; {cookie}; more"}
-        for number in range(6):
-            held += await asyncio.gather(*(stranger() for _ in range(15)))
-            assert (await answer(("POST", "estop", ways[number % 2])))[0] == 204
-        assert (await answer(("GET", f"?token={DRIVE}", {})))[0] == 303
-        if sent.endswith(b"\r\n\r\n"):
-            assert (await answer(("POST", "estop", {"Authorization": "Bearer wrong"})))[0] == 429
-            assert (await answer(("GET", "", {})))[0] == 429
-        for writer in filter(None, held):
-            writer.close()
-
-    run(scenario)
+    held = []
+    entered, cookie = await answer(("GET", f"?token={DRIVE}", {}))
+    assert entered == 303
+    ways = {"Authorization": f"bearer  {DRIVE}"}, {"Cookie": f"other=1; {cookie}; more"}
+    for number in range(6):
+        held += await asyncio.gather(*(stranger() for _ in range(15)))
+        assert (await answer(("POST", "estop", ways[number % 2])))[0] == 204
+    assert (await answer(("GET", f"?token={DRIVE}", {})))[0] == 303
+    if sent.endswith(b"\r\n\r\n"):
+        assert (await answer(("POST", "estop", {"Authorization": "Bearer wrong"})))[0] == 429
+        assert (await answer(("GET", "", {})))[0] == 429
+    for writer in filter(None, held):
+        writer.close()
     assert server.backend.estops == [True] * 6
 
 
-def test_without_a_sign_in_only_stops_are_admitted_above_the_rate_of_an_address(serve, monkeypatch):
+async def test_without_a_sign_in_only_stops_are_admitted_above_the_rate_of_an_address(serve, monkeypatch):
     monkeypatch.setattr(connections_module, "BURST_CONNECTIONS", 5.0)
     monkeypatch.setattr(connections_module, "CONNECTIONS_PER_S", 1e-5)
     server = serve()
@@ -468,31 +412,24 @@ def test_without_a_sign_in_only_stops_are_admitted_above_the_rate_of_an_address(
         writer.close()
         return status
 
-    async def scenario():
-        page = STOP.replace(b"POST /estop", b"GET /") + b"\r\n"
-        assert [await answer(page) for _ in range(7)] == [b"200"] * 5 + [b"429"] * 2
-        assert [await answer(STOP + b"\r\n") for _ in range(20)] == [b"204"] * 20
-
-    run(scenario)
+    page = STOP.replace(b"POST /estop", b"GET /") + b"\r\n"
+    assert [await answer(page) for _ in range(7)] == [b"200"] * 5 + [b"429"] * 2
+    assert [await answer(STOP + b"\r\n") for _ in range(20)] == [b"204"] * 20
 
 
-def test_connections_without_complete_headers_are_few_and_small(serve, monkeypatch):
+async def test_connections_without_complete_headers_are_few_and_small(serve, monkeypatch):
     monkeypatch.setattr(connections_module, "MOST_NEWCOMERS", 10)
     server = serve()
-
-    async def scenario():
-        opened = [await asyncio.open_connection("127.0.0.1", server.port, local_addr=ELSEWHERE) for _ in range(50)]
-        ends = [asyncio.create_task(all_of(reader)) for reader, _ in opened]
-        await until(lambda: sum(end.done() for end in ends) >= 40)
-        other, long = await asyncio.open_connection("127.0.0.1", server.port)
-        long.write(b"GET / HTTP/1.1\r\nX: " + bytes(connections_module.MOST_HEADERS))
-        assert await all_of(other) == b""
-        assert ends[-1].done() is False  # the oldest of the address with the most make room
-        for _, writer in [*opened, (other, long)]:
-            writer.close()
-        await asyncio.gather(*ends)
-
-    run(scenario)
+    opened = [await asyncio.open_connection("127.0.0.1", server.port, local_addr=ELSEWHERE) for _ in range(50)]
+    ends = [asyncio.create_task(all_of(reader)) for reader, _ in opened]
+    await until(lambda: sum(end.done() for end in ends) >= 40)
+    other, long = await asyncio.open_connection("127.0.0.1", server.port)
+    long.write(b"GET / HTTP/1.1\r\nX: " + bytes(connections_module.MOST_HEADERS))
+    assert await all_of(other) == b""
+    assert ends[-1].done() is False  # the oldest of the address with the most make room
+    for _, writer in [*opened, (other, long)]:
+        writer.close()
+    await asyncio.gather(*ends)
 
 
 SERVER_WITHOUT_FILES = """
@@ -509,7 +446,7 @@ SERVER_WITHOUT_FILES = """
 """
 
 
-def test_fault_no_file_descriptors_floods_the_log_and_locks_the_driver_out(tmp_path):
+async def test_fault_no_file_descriptors_floods_the_log_and_locks_the_driver_out(tmp_path):
     with (tmp_path / "log").open("wb") as log:
         process = subprocess.Popen(
             [sys.executable, "-c", textwrap.dedent(SERVER_WITHOUT_FILES)],
@@ -517,16 +454,12 @@ def test_fault_no_file_descriptors_floods_the_log_and_locks_the_driver_out(tmp_p
         )  # fmt: skip
     try:
         port = int(process.stdout.readline())
-
-        async def scenario():
-            held = [await asyncio.open_connection("127.0.0.1", port, local_addr=ELSEWHERE) for _ in range(60)]
-            await until(lambda: b"cannot accept" in (tmp_path / "log").read_bytes())
-            async with ConsoleClient(f"http://127.0.0.1:{port}/") as driver:
-                await driver.acquire()
-            for _, writer in held:
-                writer.close()
-
-        run(scenario)
+        held = [await asyncio.open_connection("127.0.0.1", port, local_addr=ELSEWHERE) for _ in range(60)]
+        await until(lambda: b"cannot accept" in (tmp_path / "log").read_bytes())
+        async with ConsoleClient(f"http://127.0.0.1:{port}/") as driver:
+            await driver.acquire()
+        for _, writer in held:
+            writer.close()
     finally:
         process.communicate(timeout=WAIT_S)
     assert process.returncode == 0
@@ -560,17 +493,13 @@ def test_log_lines_of_one_place_come_once_a_second_with_a_count():
     [(WSMsgType.BINARY, b"x", 1003), (WSMsgType.TEXT, b"x" * 5000, 1009), (WSMsgType.TEXT, b"\xff", 1007)],
     ids=["binary", "too long", "no UTF-8"],
 )
-def test_messages_that_no_page_sends_close_the_socket(serve, kind, payload, code):
+async def test_messages_that_no_page_sends_close_the_socket(serve, kind, payload, code):
     server = serve()
-
-    async def scenario():
-        async with aiohttp.ClientSession() as http, http.ws_connect(server.url + "ws") as socket:
-            await socket.send_frame(payload, kind)
-            while (await socket.receive()).type is WSMsgType.TEXT:
-                pass
-            assert socket.close_code == code
-
-    run(scenario)
+    async with aiohttp.ClientSession() as http, http.ws_connect(server.url + "ws") as socket:
+        await socket.send_frame(payload, kind)
+        while (await socket.receive()).type is WSMsgType.TEXT:
+            pass
+        assert socket.close_code == code
 
 
 def test_the_page_keeps_within_its_limits():
