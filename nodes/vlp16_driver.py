@@ -74,7 +74,7 @@ class Vlp16DriverNode(Node[Vlp16DriverConfig]):
         """Start the capture from its beginning."""
         try:
             now_ns, steady_ns = self.clock.now_ns(), self.clock.steady_ns()
-            self.player = CapturePlayer(self.config.pcap, self.config.rate, now_ns, steady_ns)
+            self.player = CapturePlayer(self.config.pcap, now_ns, steady_ns)
         except (CaptureError, OSError) as error:
             raise NodeError(f"pcap: {error}") from error
 

@@ -71,11 +71,9 @@ class FilesConfig(Checked):
 
     Attributes:
         rate_hz: images per second.
-        loop: start again after the last image; otherwise the last image is repeated.
     """
 
     rate_hz: Annotated[float, Plausible(0.01, 200)] = 5.0
-    loop: bool = True
 
 
 @dataclass(frozen=True)

@@ -67,10 +67,7 @@ class FileCamera(Camera):
         if not self._paths:
             raise CameraError(f"{self.path}: not connected; call connect() first")
         jpeg, width, height = self._load(self._paths[self._index])
-        if self._index + 1 < len(self._paths):
-            self._index += 1
-        elif self.config.loop:
-            self._index = 0
+        self._index = (self._index + 1) % len(self._paths)
         return Frame(jpeg, self._stamp_ns(), width, height)
 
     def close(self) -> None:

@@ -123,14 +123,8 @@ class ThetaClient:
         )
 
     def execute(self, name: str, parameters: Mapping[str, Any] | None = None) -> dict[str, Any]:
-        """Run a command, wait until it ends and return its results."""
+        """Run a command and return its results."""
         reply = self._call("POST", "/osc/commands/execute", {"name": name, "parameters": dict(parameters or {})})
-        deadline = time.monotonic() + self.config.connect_timeout_s
-        while reply.get("state") == "inProgress":
-            if time.monotonic() > deadline:
-                raise CameraError(f"{self.url}: {name} did not finish within {self.config.connect_timeout_s} s")
-            self.sleep(0.1)
-            reply = self._call("POST", "/osc/commands/status", {"id": reply.get("id", "")})
         results = reply.get("results", {})
         return results if isinstance(results, dict) else {}
 

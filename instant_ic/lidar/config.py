@@ -74,7 +74,6 @@ class Vlp16DriverConfig(ReceiverConfig):
     Attributes:
         source: ``udp``, ``pcap``, or ``topic`` (packets of a bag from /lidar/packets).
         pcap: capture file, for source pcap.
-        rate: playback rate of the capture; 1 is the recorded rate.
         loop: start the capture again at its end.
         frame_id: the sensor's frame.
         lidar_mount: the sensor's pose on base_link.
@@ -85,7 +84,6 @@ class Vlp16DriverConfig(ReceiverConfig):
 
     source: Literal["udp", "pcap", "topic"] = "udp"
     pcap: str = ""
-    rate: Annotated[float, Plausible(0.01, 1000)] = 1.0
     loop: bool = False
     frame_id: str = "velodyne"
     lidar_mount: Mount = LIDAR_MOUNT

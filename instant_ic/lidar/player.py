@@ -1,4 +1,4 @@
-"""Playback of a capture at its recorded rate, or faster or slower."""
+"""Playback of a capture at its recorded rate."""
 
 from __future__ import annotations
 
@@ -13,7 +13,6 @@ class CapturePlayer:
 
     Args:
         path: capture file.
-        rate: playback rate; 1 is the recorded rate.
         now_ns: clock of the stamps at the start.
         steady_ns: steady time of the start.
 
@@ -22,13 +21,12 @@ class CapturePlayer:
         OSError: the file cannot be read.
     """
 
-    def __init__(self, path: str, rate: float, now_ns: int, steady_ns: int) -> None:
+    def __init__(self, path: str, now_ns: int, steady_ns: int) -> None:
         self._reader = CaptureReader(path)
         self._datagrams = iter(self._reader)
         self._next: Datagram | None = next(self._datagrams, None)
         if self._next is None:
             raise CaptureError(f"{path}: holds no UDP datagram ({dict(self._reader.skipped)})")
-        self._rate = rate
         self._first_ns = self._next.stamp_ns
         self._start_ns, self._start_steady_ns = now_ns, steady_ns
 
@@ -38,11 +36,8 @@ class CapturePlayer:
         return self._next is None
 
     def due(self, steady_ns: int) -> Iterator[Datagram]:
-        """Yield the datagrams that are due at a steady time, with stamps relative to the start of the playback.
-
-        Stamps keep the sensor's own rate at any playback rate; otherwise its clock would seem to drift.
-        """
-        elapsed_ns = (steady_ns - self._start_steady_ns) * self._rate
+        """Yield the datagrams that are due at a steady time, with stamps relative to the start of the playback."""
+        elapsed_ns = steady_ns - self._start_steady_ns
         while self._next is not None and self._next.stamp_ns - self._first_ns <= elapsed_ns:
             datagram, self._next = self._next, next(self._datagrams, None)
             yield datagram._replace(stamp_ns=self._start_ns + datagram.stamp_ns - self._first_ns)

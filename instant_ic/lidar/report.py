@@ -21,10 +21,6 @@ _SILENT = {
 """Messages to the operator when no packets arrive, by source."""
 _LEAST_RETURNS = 0.01
 """Share of rays with a return below which the sensor counts as covered. The ground alone gives more."""
-_PAST_HOUR = (
-    "The sensor counts its time of the hour beyond 3600 s; it is taken modulo the hour. Check the sensor's GPS "
-    "receiver and pulse per second."
-)
 _LEAST_BLOCKED_DEG = 5.0
 """A smaller sector without blocks is not reported; two blocks at 1200 rpm take 1.6 degrees."""
 _VIEW = "The sensor measures {view} degrees only, clockwise from ahead"
@@ -54,7 +50,6 @@ class LidarReport:
         self._feed = feed
         self._repeats = RepeatWatch()
         self._reported = (0, 0, 0)
-        self._past_hour_reported = False
         self._covered = True
         self._partial_reported = 0
 
@@ -100,7 +95,7 @@ class LidarReport:
         return Diagnosis("source", Level.ERROR if doubt else Level.OK, doubt or "one sender, in order", values)
 
     def check(self, steady_ns: int, silence_s: float, source: str, where: str) -> Iterator[Diagnosis]:
-        """Yield the diagnoses of sender, clock, view and packets since the last call.
+        """Yield the diagnoses of sender, view and packets since the last call.
 
         Args:
             steady_ns: steady time.
@@ -109,7 +104,6 @@ class LidarReport:
             where: address or file of the source.
         """
         yield self.source(steady_ns)
-        yield from self._clock()
         if self._feed.stream.counters.revolutions:
             yield self._view()
         stream, counters = self._feed.stream, self._feed.stream.counters
@@ -122,7 +116,6 @@ class LidarReport:
             "missing": counters.missing,
             "late": counters.late,
             "bad": counters.bad,
-            "past_hour": counters.past_hour,
             "clock_resets": counters.clock_resets + stream.clock.resets,
             "revolutions_skipped": self.skipped,
             "revolutions_partial": self.partial,
@@ -143,17 +136,12 @@ class LidarReport:
             text = (
                 f"in the last second {new[0]} packets missing, {new[1]} not from a VLP-16, {new[2]} revolutions skipped"
             )
+            text += f" ({counters.bad_reason})" if new[1] else ""
         else:
             partial, self._partial_reported = self.partial - self._partial_reported, self.partial
             if partial:
                 text += f"; {partial} incomplete revolutions gave no scan"
         yield Diagnosis("packets", level, text, values)
-
-    def _clock(self) -> Iterator[Diagnosis]:
-        """Warn once of a sensor whose time of the hour does not wrap. Its packets are used all the same."""
-        if self._feed.stream.counters.past_hour:
-            yield Diagnosis("clock", Level.OK if self._past_hour_reported else Level.WARN, _PAST_HOUR)
-            self._past_hour_reported = True
 
     def _view(self) -> Diagnosis:
         """Return a diagnosis of the field of view, which may be why there is no scan although every packet arrives."""

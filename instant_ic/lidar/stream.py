@@ -1,14 +1,11 @@
 """Revolutions from the stream of data packets, with a count of the missing ones."""
 
 import struct
-from collections.abc import Iterator
-from dataclasses import dataclass, field
-from pathlib import Path
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from instant_ic.lidar.capture import CaptureReader
 from instant_ic.lidar.clock import DeviceClock
 from instant_ic.lidar.config import DecoderConfig
 from instant_ic.lidar.decode import DecodedPackets, decode_packets, turn_to
@@ -68,8 +65,7 @@ class StreamCounters:
         packets: accepted data packets.
         missing: packets that never arrived.
         late: packets dropped because a newer one, or one of the same time, had already arrived.
-        bad: payloads dropped because they are not data packets; by reason in ``bad_reasons``.
-        past_hour: accepted or late packets whose time of the hour was beyond 3600 s.
+        bad: payloads dropped because they are not data packets; the newest reason is ``bad_reason``.
         clock_resets: jumps of the sensor's clock (the sensor or a capture was restarted).
         revolutions: returned revolutions.
     """
@@ -78,10 +74,9 @@ class StreamCounters:
     missing: int = 0
     late: int = 0
     bad: int = 0
-    past_hour: int = 0
     clock_resets: int = 0
     revolutions: int = 0
-    bad_reasons: dict[str, int] = field(default_factory=dict)
+    bad_reason: str = ""
 
 
 class PacketStream:
@@ -123,9 +118,8 @@ class PacketStream:
                 reason = "azimuth out of range"
         if reason is not None:
             self.counters.bad += 1
-            self.counters.bad_reasons[reason] = self.counters.bad_reasons.get(reason, 0) + 1
+            self.counters.bad_reason = reason
             return None
-        self.counters.past_hour += timestamp_us >= HOUR_US
         timestamp_us %= HOUR_US
 
         dual = mode == RETURN_DUAL
@@ -188,18 +182,6 @@ class PacketStream:
     def finish(self) -> Revolution | None:
         """Return the rest as the last revolution, for example at the end of a capture."""
         return self._end_early()
-
-    def revolutions(self, path: str | Path) -> Iterator[Revolution]:
-        """Yield all revolutions of a capture file, including the partial first and last ones.
-
-        Raises:
-            CaptureError: the file is not a capture.
-        """
-        for stamp_ns, _, payload in CaptureReader(path):
-            if len(payload) == DATA_PACKET_BYTES and (revolution := self.feed(payload, stamp_ns)) is not None:
-                yield revolution
-        if (last := self.finish()) is not None:
-            yield last
 
     def _end_at_cut(self, block: int) -> Revolution | None:
         """End the revolution before a block of the newest packet."""

@@ -49,7 +49,6 @@ class Behaviour:
     busy: int = 0
     password: str = ""
     chunked: bool = True
-    in_progress: int = 0
     state: dict[str, Any] = field(default_factory=lambda: {"batteryLevel": 0.83, "_batteryTemp": 30, "_boardTemp": 41})
     firmware: str = "3.10.2"
     options: ThetaOptions = field(init=False)
@@ -111,9 +110,6 @@ class _Handler(BaseHTTPRequestHandler):
         if self.path == "/osc/state":
             self._json(200, {"fingerprint": "F", "state": behaviour.state})
             return
-        if self.path == "/osc/commands/status":
-            self._json(200, {"name": "camera.setOptions", "state": "done", "results": {}})
-            return
         request = json.loads(body)
         behaviour.commands.append(request["name"])
         try:
@@ -125,11 +121,7 @@ class _Handler(BaseHTTPRequestHandler):
         behaviour = self.camera.behaviour
         if name == "camera.setOptions":
             behaviour.options.set(request["parameters"]["options"])
-            if behaviour.in_progress:
-                behaviour.in_progress -= 1
-                self._json(200, {"name": name, "state": "inProgress", "id": "7"})
-            else:
-                self._json(200, {"name": name, "state": "done"})
+            self._json(200, {"name": name, "state": "done"})
         elif name == "camera.getOptions":
             options = behaviour.options.get(request["parameters"]["optionNames"]) | behaviour.reported
             options = {key: value for key, value in options.items() if value is not None}

@@ -133,12 +133,6 @@ def test_refused_command_gives_the_cameras_words() -> None:
             client.open_preview()
 
 
-def test_command_in_progress_is_waited_for() -> None:
-    with FakeTheta(Behaviour(in_progress=1)) as theta:
-        ThetaClient(theta.url, CONFIG, sleep=lambda s: None).set_options({"sleepDelay": 60})
-        assert theta.behaviour.options.values["sleepDelay"] == 60
-
-
 def test_state_with_errors() -> None:
     with FakeTheta() as theta:
         client = ThetaClient(theta.url, CONFIG)

@@ -88,14 +88,6 @@ def test_capture_gives_points_packets_scans_and_the_mount(capture: Path) -> None
     assert node.diagnoses()["position"][:2] == (OK, "pulse per second locked")
 
 
-def test_capture_at_twice_the_pace_takes_half_the_time_with_the_same_stamps(capture: Path) -> None:
-    bus, _ = played(capture, rate=2.0)
-    bus.advance(0.21)
-    assert len(bus.messages("/scan")) == 4
-    stamps = [stamp_ns(scan) for scan in bus.messages("/scan")]
-    assert stamps[2] - stamps[1] == pytest.approx(0.1 * SECOND, rel=5e-3)
-
-
 def test_packets_of_a_bag_give_the_same_again_bit_for_bit(capture: Path) -> None:
     bus, _ = played(capture)
     bus.advance(0.5)
