@@ -113,18 +113,6 @@ def read_recording(
     )
 
 
-def read_clouds(bag: BagReader, points_topic: str = "") -> tuple[TransformBuffer, Iterator[CalibrationCloud]]:
-    """Return the all transforms of a bag, and its LiDAR revolutions, from points or packets.
-
-    Raises:
-        BagError: the bag is damaged.
-        CalibrationError: the bag has no LiDAR data, or not on the topic given.
-    """
-    types = {topic.topic: topic.type_name for topic in bag.topics}
-    topic = _choose(bag.path, types, (CLOUD, PACKETS), points_topic, ("/lidar/points", "/lidar/packets"))
-    return _transforms(bag, types), _clouds(bag, topic, types[topic], lambda ns: True)
-
-
 def _choose(path: Path, types: dict[str, str], kinds: tuple[str, ...], wanted: str, usual: tuple[str, ...]) -> str:
     found = sorted(topic for topic, kind in types.items() if kind in kinds)
     names = " or ".join(kind.rsplit("/", 1)[-1] for kind in kinds)

@@ -3,17 +3,12 @@
 from __future__ import annotations
 
 import argparse
-import functools
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from instant_ic.cli.arguments import check_files, group, positive, verb
 from instant_ic.cli.errors import UserError
-
-if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
 
 SAVE, SAVED, LOCAL = "/slam/save", "/slam/saved", "/map/local"
 
@@ -30,15 +25,12 @@ def add_parser(subparsers: Any) -> None:
     add("--timeout", type=positive, default=20.0, metavar="S", help=text)
     add = verb(
         verbs, "local", "save the local 3D model as a point cloud", save_local,
-        "ic map local -o cloud.ply; ic map local runs/drive -o cloud.ply",
+        "ic map local -o cloud.ply",
         "Save the local 3D model (what the LiDAR has measured over the last 10 m of the way) as a PLY file, in the "
-        "map frame: that of the running stack (topic /map/local), or that at the end of a bag.",
+        "map frame (topic /map/local of the running stack, also of `ic launch replay bag:=BAG`).",
     ).add_argument  # fmt: skip
-    add("bag", type=Path, nargs="?", metavar="BAG", help="a recording (default: the running stack)")
     add("-o", "--out", type=Path, required=True, metavar="FILE.ply", help="point cloud to write")
     add("--timeout", type=positive, default=10.0, metavar="S", help=text)
-    text = "LiDAR points in the bag (default: /lidar/points, else /lidar/packets)"
-    add("--points", default="", metavar="TOPIC", help=text)
 
 
 def save_map(args: argparse.Namespace) -> int:
@@ -72,49 +64,19 @@ def save_map(args: argparse.Namespace) -> int:
 
 
 def save_local(args: argparse.Namespace) -> int:
+    from instant_ic.cli.observer import newest
     from instant_ic.geometry.ply import write_ply
+    from instant_ic.msg import cloud_xyz, deserialize
 
     out = args.out.expanduser()
     check_files(out)
-    points = _local_of_bag(args.bag, args.points) if args.bag else _local_of_stack(args.timeout)
+    received = newest(LOCAL, args.timeout)
+    if received is None:
+        raise UserError(
+            f"no local model on {LOCAL} within {args.timeout:g} s: depth_scaler is not running, or the LiDAR or "
+            "odometry is missing (ic node list, ic topic hz /lidar/points)"
+        )
+    points = cloud_xyz(deserialize(received.payload, received.type_name))
     write_ply(out, points)
     print(f"wrote {out}: {len(points)} points")
     return 0
-
-
-def _local_of_bag(path: Path, topic: str) -> NDArray[np.float32]:
-    from instant_ic.bag.files import BagReader
-    from instant_ic.calibration.bag import read_clouds
-    from instant_ic.geometry.transforms import TransformError
-    from instant_ic.lidar.deskew import TimedPoints
-    from instant_ic.mapping.mapper import LocalMapper
-    from instant_ic.msg import cloud_points
-
-    with BagReader(path) as bag:
-        transforms, clouds = read_clouds(bag, topic)
-        mapper, problem, count = LocalMapper(transforms), "", 0
-        for cloud in clouds:
-            count += 1
-            try:
-                points = cloud.points
-                xyz = functools.partial(cloud_points, points)
-                mapper.revolution(TimedPoints(cloud.frame_id, cloud.stamp_ns, points["time"], xyz))
-            except (TransformError, ValueError) as error:
-                problem = str(error)
-    if mapper.model.revolutions == 0:
-        why = f": {problem}" if problem else " (two are needed)"
-        raise UserError(f"{path}: none of {count} LiDAR revolutions can be placed{why}")
-    return mapper.cloud()
-
-
-def _local_of_stack(timeout_s: float) -> NDArray[np.float32]:
-    from instant_ic.cli.observer import newest
-    from instant_ic.msg import cloud_xyz, deserialize
-
-    received = newest(LOCAL, timeout_s)
-    if received is None:
-        raise UserError(
-            f"no local model on {LOCAL} within {timeout_s:g} s: depth_scaler is not running, or the LiDAR or odometry "
-            "is missing (ic node list, ic topic hz /lidar/points)"
-        )
-    return cloud_xyz(deserialize(received.payload, received.type_name))
