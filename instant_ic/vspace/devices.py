@@ -6,17 +6,15 @@ import dataclasses
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import TypeVar
 
 import numpy as np
 
 from instant_ic.vspace.config import FieldConfig, GeometryConfig, TrainConfig, VirtualSpaceConfig
-from instant_ic.vspace.nerf.field import Device, FieldParameters, Floats, Lattice, Rays, TrainingScene
+from instant_ic.vspace.nerf.field import Device, Lattice, Rays, TrainingScene
 from instant_ic.vspace.nerf.occupancy import build_occupancy
 from instant_ic.vspace.prior import prepare
 from instant_ic.vspace.view import perspective_rays
 
-T = TypeVar("T")
 AGREEMENT = 0.1
 """Allowed relative difference between Triton's and numba's training errors: Triton's tables are float16."""
 
@@ -59,89 +57,7 @@ def make_device(config: VirtualSpaceConfig) -> tuple[Device, str]:
                 warning = f"{reason}: on the CPU"
         elif wants_gpu:
             raise DeviceError("device is cuda, but torch finds no CUDA device; use auto or cpu")
-    return _cpu_device(config.field, config.train), warning
-
-
-class FallbackDevice:
-    """The backend of a space; with ``device: auto``, a GPU that runs out of memory is replaced by the CPU.
-
-    Args:
-        config: parameters of the space.
-
-    Attributes:
-        backend: the backend in use.
-        warning: problem of the device; empty when there is none.
-
-    Raises:
-        DeviceError: a device was asked for that is not there, or does not work.
-    """
-
-    def __init__(self, config: VirtualSpaceConfig) -> None:
-        self._config = config
-        self._scene: TrainingScene | None = None
-        self.backend, self.warning = make_device(config)
-
-    @property
-    def name(self) -> str:
-        """Name of the hardware and the backend."""
-        return self.backend.name
-
-    @property
-    def on_gpu(self) -> bool:
-        """True if the backend computes on a GPU."""
-        return self.backend.on_gpu
-
-    def load(self, parameters: FieldParameters) -> None:
-        """Load parameters and reset the optimiser's moments."""
-        self.backend.load(parameters)
-
-    def parameters(self) -> FieldParameters:
-        """Return a copy of the present parameters."""
-        return self.backend.parameters()
-
-    def set_scene(self, scene: TrainingScene) -> None:
-        """Train and render this scene from now on, with the present parameters."""
-        self._call(lambda: self.backend.set_scene(scene))
-        self._scene = scene
-
-    def start_anew(self, scene: TrainingScene, parameters: FieldParameters) -> None:
-        """Train this scene from other parameters; a failure leaves the old scene and parameters."""
-        learnt, old = self.parameters(), self._scene
-
-        def start() -> None:
-            self.backend.load(parameters)
-            self.backend.set_scene(scene)
-
-        try:
-            self._call(start)
-        except Exception:
-            self.backend.load(learnt)
-            if old is not None:
-                self.backend.set_scene(old)
-            raise
-        self._scene = scene
-
-    def step(self, uniform: Floats, table_lr: float, network_lr: float) -> tuple[float, float]:
-        """Train one iteration, as ``Device.step``."""
-        return self._call(lambda: self.backend.step(uniform, table_lr, network_lr))
-
-    def render_rays(self, rays: Rays, panorama_share: float, depth_share: float) -> tuple[Floats, Floats, Floats]:
-        """Render rays, as ``Device.render_rays``."""
-        return self._call(lambda: self.backend.render_rays(rays, panorama_share, depth_share))
-
-    def _call(self, work: Callable[[], T]) -> T:
-        try:
-            return work()
-        except RuntimeError as error:
-            if not is_out_of_memory(error) or self._config.device != "auto":
-                raise
-            self.warning = f"{self.name} is out of memory; on the CPU from now on ({error})"
-        parameters = self.backend.parameters()
-        self.backend, _ = make_device(dataclasses.replace(self._config, device="cpu"))
-        self.backend.load(parameters)
-        if self._scene is not None:
-            self.backend.set_scene(self._scene)
-        return work()
+    return cpu_device(config.field, config.train), warning
 
 
 def _may_have_cuda() -> bool:
@@ -149,7 +65,8 @@ def _may_have_cuda() -> bool:
     return any(Path(place).exists() for place in ("/dev/nvidiactl", "/dev/nvmap", "/dev/dxg"))
 
 
-def _cpu_device(field: FieldConfig, train: TrainConfig) -> Device:
+def cpu_device(field: FieldConfig, train: TrainConfig) -> Device:
+    """Return the numba backend."""
     from instant_ic.vspace.nerf.numba_device import NumbaDevice  # compiled code: half a second
 
     return NumbaDevice(field, train)
@@ -182,7 +99,7 @@ def check_device(make: Callable[[FieldConfig, TrainConfig], Device], field: Fiel
     """
     small = dataclasses.replace(field, log2_table=10)
     train = TrainConfig(ray_columns=16, ray_rows=8)
-    ours, theirs = make(small, train), _cpu_device(small, train)
+    ours, theirs = make(small, train), cpu_device(small, train)
     scene, rays = _scratch(small)
     uniform = np.random.default_rng(0).random((2, train.ray_columns * train.ray_rows, 3), np.float32)
     for device in (ours, theirs):

@@ -7,25 +7,28 @@ import enum
 import math
 import time
 from collections import deque
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from instant_ic.geometry.image_quality import psnr_of_mse
 from instant_ic.vspace.choice import Choice, WarpTrial, gain_db, trials
-from instant_ic.vspace.composition import ComposedView, compose, dissolve, filled_image, to_8bit
+from instant_ic.vspace.composition import ComposedView, Rendering, compose, dissolve, filled_image, to_8bit
 from instant_ic.vspace.config import VirtualSpaceConfig
-from instant_ic.vspace.devices import FallbackDevice
+from instant_ic.vspace.devices import cpu_device, is_out_of_memory, make_device
 from instant_ic.vspace.keyframes import Keyframe, KeyframeSet, extended
-from instant_ic.vspace.nerf.field import FieldParameters, Lattice, Rays, Schedule, TrainingScene
+from instant_ic.vspace.nerf.field import Device, FieldParameters, Lattice, Rays, Schedule, TrainingScene
 from instant_ic.vspace.nerf.occupancy import build_occupancy
 from instant_ic.vspace.prior import PanoramaPrior, prepare
 from instant_ic.vspace.readiness import error_terms, expected_psnr_db
 from instant_ic.vspace.saved import SavedSpace, TrainingProgress, read, write
 from instant_ic.vspace.view import RayRenderer, View
 
+T = TypeVar("T")
 PROBE_COLUMNS = 64
 """Columns of the pixels of a view by which its quality is estimated."""
 PARALLAX_RAD = 0.035
@@ -159,7 +162,7 @@ class VirtualSpace(RayRenderer):
         if self.config.source == "mesh":
             raise ValueError("source is mesh: nothing is learnt there; use make_space, which renders the mesh")
         self._robot = robot
-        self.device = FallbackDevice(self.config)
+        self.device, self._warning = make_device(self.config)
         if self.config.source == "auto":
             source = "field" if self.device.on_gpu else "warp"
             self.config = dataclasses.replace(self.config, source=source)
@@ -275,10 +278,9 @@ class VirtualSpace(RayRenderer):
     def _learn(self, scene: TrainingScene) -> None:
         old = self.scene
         refresh = old is not None and scene.lattice is old.lattice
-        if refresh or old is None:
-            self.device.set_scene(scene)
-        else:
-            self.device.start_anew(scene, FieldParameters.random(self.config.field, self.config.train.seed))
+        anew = old is not None and not refresh
+        parameters = FieldParameters.random(self.config.field, self.config.train.seed) if anew else None
+        self._on_device(lambda device: device.set_scene(scene, parameters))
         self.scene, self.trials = scene, ()
         self._ready = self._ready and (refresh or not self.config.picture.field_alone)
         self._run = TrainingRun(self.config, refresh, self._run.colour_error if refresh else math.nan)
@@ -299,7 +301,8 @@ class VirtualSpace(RayRenderer):
         limit = self.config.train.iterations if iterations is None else iterations
         shape = (self.config.train.ray_columns * self.config.train.ray_rows, 3)
         while not self._done and done < limit:
-            colour, _ = self.device.step(self._rng.random(shape, np.float32), *run.schedule.rates())
+            uniform, rates = self._rng.random(shape, np.float32), run.schedule.rates()
+            colour, _ = self._on_device(lambda device: device.step(uniform, *rates))  # noqa: B023 - called at once
             run.schedule.iteration += 1
             done += 1
             if run.schedule.finished or run.schedule.iteration % self.config.readiness.plateau_iterations == 0:
@@ -311,7 +314,7 @@ class VirtualSpace(RayRenderer):
 
     def _choose(self) -> None:
         """Show the field or the warp, whichever renders the older keyframes better."""
-        renderings = [self.device.render_rays(trial.rays, 0.0, LEAST_DEPTH_SHARE) for trial in self.trials]
+        renderings = [self._render_field(trial.rays, 0.0) for trial in self.trials]
         left = self.config.train.iterations - self._run.schedule.iteration
         self.choice.take(gain_db(self.trials, renderings), left / self.config.readiness.plateau_iterations)
 
@@ -336,7 +339,7 @@ class VirtualSpace(RayRenderer):
             converged=self._shown is not None and self._done,
             source=self.config.source,
             device=self.device.name,
-            warning=self.device.warning,
+            warning=self._warning,
             shows_field=self._panorama_share == 0,
             gain_db=self.choice.gain_db,
         )
@@ -384,8 +387,26 @@ class VirtualSpace(RayRenderer):
         """Render a keyframe: its panorama warped, or the field; a panorama ``around`` is not warped."""
         share, field = self._panorama_share, None
         if share == 0 or around:
-            field = self.device.render_rays(rays, share, max(share, LEAST_DEPTH_SHARE))
+            field = self._render_field(rays, share)
         return compose(rays, None if around else shown.newest, field)
+
+    def _render_field(self, rays: Rays, share: float) -> Rendering:
+        """Render the field, with the weight ``share`` of the panorama's colours."""
+        return self._on_device(lambda device: device.render_rays(rays, share, max(share, LEAST_DEPTH_SHARE)))
+
+    def _on_device(self, work: Callable[[Device], T]) -> T:
+        """Use the device; with ``device: auto``, the CPU continues for a GPU that is out of memory."""
+        try:
+            return work(self.device)
+        except RuntimeError as error:
+            if not is_out_of_memory(error) or self.config.device != "auto":
+                raise
+            self._warning = f"{self.device.name} is out of memory; on the CPU from now on ({error})"
+        parameters, self.device = self.device.parameters(), cpu_device(self.config.field, self.config.train)
+        self.device.load(parameters)
+        if self.scene is not None:
+            self.device.set_scene(self.scene)
+        return work(self.device)
 
     @property
     def _panorama_share(self) -> float:

@@ -81,7 +81,7 @@ def test_kernels_that_fail_are_left_for_the_cpu_with_a_warning(gpu, fault, words
     with pytest.raises(DeviceError, match="the Triton kernels do not work here"):
         make_device(with_device("cuda"))
     space = VirtualSpace(with_device("auto"))
-    assert isinstance(space.device.backend, NumbaDevice)
+    assert isinstance(space.device, NumbaDevice)
     assert words in space.status.warning and "on the CPU" in space.status.warning
 
 

@@ -94,7 +94,7 @@ def test_a_field_that_loses_is_not_shown_and_stops():
 def test_a_field_that_wins_is_shown_until_it_loses(monkeypatch):
     space = driven(3)
     true, colours = (
-        space.device.backend.render_rays,
+        space.device.render_rays,
         {trial.rays.origin.tobytes(): trial.truth for trial in space.trials},
     )
     before = space.render(space.keyframe.map_from_camera, 48, 27, 1.5).rgb
@@ -105,7 +105,7 @@ def test_a_field_that_wins_is_shown_until_it_loses(monkeypatch):
         return truth + np.float32(0.01), *true(rays, panorama_share, depth_share)[1:]
 
     with monkeypatch.context() as patch:
-        patch.setattr(space.device.backend, "render_rays", render_rays)
+        patch.setattr(space.device, "render_rays", render_rays)
         space.train(iterations=10)
         assert space.status.shows_field and space.status.gain_db > 3
         assert space.render(space.keyframe.map_from_camera, 48, 27, 1.5).rgb.mean() > 240

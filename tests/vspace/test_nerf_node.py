@@ -166,7 +166,7 @@ def test_a_gpu_without_memory_is_told_and_the_next_keyframe_recovers(bus):
     bus.publish("/keyframe", keyframe_message(1), latched=True)
     bus.advance(0.3)
     node = next(n for n in bus.nodes if isinstance(n, NerfNode))
-    device = node.worker.space.device.backend
+    device = node.worker.space.device
     whole = device.step
 
     def no_memory(*args):

@@ -204,7 +204,7 @@ def test_a_gpu_without_memory_is_left_for_the_cpu_with_what_is_learnt(call, monk
     # Pictures by the field.
     ready = dataclasses.replace(SMALL, readiness=ReadinessConfig(psnr_db=1), picture=FIELD_ONLY.picture)
     space, whole = trained(6, ready), trained(6, ready)
-    monkeypatch.setattr(space.device.backend, call, no_memory)
+    monkeypatch.setattr(space.device, call, no_memory)
     assert not space.status.warning
     for s in (space, whole):
         if call == "set_scene":
@@ -224,12 +224,12 @@ def test_a_gpu_that_was_asked_for_fails_aloud_and_the_next_keyframe_recovers(mon
     space = trained(6, dataclasses.replace(SMALL, device="cpu"))  # any device that was asked for by name
     before = space.render(CAMERA, 64, 36, 1.5)
     with monkeypatch.context() as patch:
-        patch.setattr(space.device.backend, "set_scene", no_memory)
+        patch.setattr(space.device, "set_scene", no_memory)
         with pytest.raises(torch.OutOfMemoryError):
             refreshed(space)
         assert np.array_equal(space.render(CAMERA, 64, 36, 1.5).rgb, before.rgb)  # the old space is whole
         picture = box_room.panorama(CAMERA, 192)
-        patch.setattr(space.device.backend, "set_scene", once(space.device.backend.set_scene))
+        patch.setattr(space.device, "set_scene", once(space.device.set_scene))
         with pytest.raises(torch.OutOfMemoryError):
             space.set_keyframe(picture.rgb, 5 * picture.depth_m, CAMERA, 0.02)  # would start anew
         assert np.array_equal(space.render(CAMERA, 64, 36, 1.5).rgb, before.rgb)

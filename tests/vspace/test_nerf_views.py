@@ -39,9 +39,9 @@ def test_a_panorama_from_aside_is_the_rooms(space):
 def test_interpolation_between_traced_pixels_changes_a_panorama_little(space):
     coarse = space.render_equirect(ASIDE, 512)
     assert [equirect_rays(ASIDE, width).stride for width in (192, 512, 1024)] == [1, 2, 4]
-    space.device.backend.first_stride = 1
+    space.device.first_stride = 1
     full = space.render_equirect(ASIDE, 512)
-    space.device.backend.first_stride = 4
+    space.device.first_stride = 4
     both = (coarse.depth_m > 0) & (full.depth_m > 0)
     assert both.mean() > 0.95
     relative = np.abs(coarse.depth_m[both] / full.depth_m[both] - 1)

@@ -74,7 +74,9 @@ class TorchDevice:
         self._field = TorchField(*tensors, *lattice)
         self._state = self._fresh_state()
 
-    def set_scene(self, scene: TrainingScene) -> None:
+    def set_scene(self, scene: TrainingScene, parameters: FieldParameters | None = None) -> None:
+        if parameters is not None:
+            self.load(parameters)
         grid, lattice = scene.occupancy, scene.lattice
         arrays = (grid.distance, grid.origin, lattice.cells_per_m, lattice.origin, scene.focus)
         # All that needs memory comes first: where there is none, the old scene stays whole.

@@ -246,8 +246,13 @@ class Device(Protocol):
     def load(self, parameters: FieldParameters) -> None:
         """Load parameters and reset the optimiser's moments."""
 
-    def set_scene(self, scene: TrainingScene) -> None:
-        """Train and render this scene from now on, with the present parameters; resets the moments."""
+    def set_scene(self, scene: TrainingScene, parameters: FieldParameters | None = None) -> None:
+        """Train and render this scene from now on; resets the moments. A failure leaves the old scene.
+
+        Args:
+            scene: the scene.
+            parameters: parameters to start from; None for the present ones.
+        """
 
     def step(self, uniform: Floats, table_lr: float, network_lr: float) -> tuple[float, float]:
         """One iteration on the rays sampled by ``uniform`` (N, 3) from the keyframes in turn (``ray_sources``).

@@ -61,12 +61,9 @@ class NumbaDevice:
         self._network_moments = tuple((np.zeros_like(a), np.zeros_like(a)) for a in parameters.network())
         self._steps = 0
 
-    def set_scene(self, scene: TrainingScene) -> None:
+    def set_scene(self, scene: TrainingScene, parameters: FieldParameters | None = None) -> None:
+        self.load(self._p if parameters is None else parameters)
         self._scene, self._focus, self._priors = scene, scene.focus, StackedPriors.of(scene)
-        for moments in (self._table_moments, *self._network_moments):
-            for moment in moments:
-                moment[...] = 0
-        self._steps = 0
 
     def step(self, uniform: Floats, table_lr: float, network_lr: float) -> tuple[float, float]:
         """One training step: sample rays, gradient, Adam; as ``reference.train_step``."""

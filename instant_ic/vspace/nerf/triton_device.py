@@ -128,8 +128,10 @@ class TritonDevice:
         self._p = self._uploaded(parameters)
         self._forget()
 
-    def set_scene(self, scene: TrainingScene) -> None:
-        self._scene = self._uploaded_scene(scene)  # all that needs memory first: without it the old scene stays whole
+    def set_scene(self, scene: TrainingScene, parameters: FieldParameters | None = None) -> None:
+        # Everything that needs memory comes first: without it the old scene stays whole.
+        loaded = self._p if parameters is None else self._uploaded(parameters)
+        self._scene, self._p = self._uploaded_scene(scene), loaded
         self._forget()
 
     def step(self, uniform: Floats, table_lr: float, network_lr: float) -> tuple[float, float]:
