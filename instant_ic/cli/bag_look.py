@@ -14,7 +14,7 @@ from typing import Any
 from instant_ic.bag import BagError, BagReader
 from instant_ic.bag.compare import Tolerance, TopicDifference, compare
 from instant_ic.bag.recover import recover as recover_bag
-from instant_ic.cli.commands.bag import pairs, topic_names
+from instant_ic.cli.commands.bag import pairs
 from instant_ic.cli.errors import UserError
 from instant_ic.msg import deserialize
 
@@ -119,7 +119,7 @@ def _info(reader: BagReader) -> dict[str, Any]:
 
 
 def diff(args: argparse.Namespace) -> int:
-    found = compare(Path(args.a), Path(args.b), tuple(topic_names(args.ignore)), args.common, tolerance_of(args))
+    found = compare(Path(args.a), Path(args.b), tuple(args.ignore), args.common, tolerance_of(args))
     if not found:
         raise UserError("there are no topics to compare")
     if args.json:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import json
 import os
 import time
@@ -13,7 +14,7 @@ from instant_ic.bus.control import ControlError, NodeBusyError, NodeControl
 from instant_ic.bus.node_files import node_class
 from instant_ic.bus.process import run as run_node
 from instant_ic.bus.registry import NodeInfo, list_nodes
-from instant_ic.cli.commands.bag import argument_of, topic_names
+from instant_ic.cli.commands.bag import argument_of
 from instant_ic.cli.errors import UserError
 from instant_ic.util.paths import run_dir
 
@@ -22,50 +23,25 @@ _STEERED = ("bag_recorder", "bag_player")
 
 
 def record(args: argparse.Namespace) -> int:
-    if args.output and Path(args.output).exists() and not args.snapshot:
-        raise UserError(f"{args.output} exists already: choose another name with -o")
-    words = ["--name", f"bag_recorder_{os.getpid()}"]
-    words += _parameters(
-        path=args.output,
-        duration_s=args.duration,
-        topics=topic_names(args.topics),
-        exclude=topic_names(args.exclude),
-        compressed=args.compression,
-        max_bag_size=args.max_bag_size,
-        max_bag_duration=args.max_bag_duration,
-        queue_mb=_megabytes(args.max_queue),
-        min_free_mb=args.min_free // 1_000_000,
-        snapshot=args.snapshot,
-        max_cache_mb=_megabytes(args.max_cache_size),
-    )
-    if args.snapshot:
-        words += _parameters(snapshot_seconds=args.snapshot_seconds, snapshot_after_s=args.snapshot_after)
-    words += _parameters(use_sim_time=True) if args.use_sim_time else []
-    return run_node(node_class("bag_recorder"), words)
+    if "path" in args and "snapshot" not in args and Path(args.path).exists():
+        raise UserError(f"{args.path} exists already: choose another name with -o")
+    return _run("bag_recorder", args, "use_sim_time" in args)
 
 
 def play(args: argparse.Namespace) -> int:
     if not Path(args.bag).exists():
         raise UserError(f"bag {args.bag} does not exist")
-    words = ["--name", f"bag_player_{os.getpid()}"]
-    words += _parameters(
-        use_sim_time=True,
-        bag=args.bag,
-        rate=args.rate,
-        start_offset_s=args.start,
-        duration_s=args.duration,
-        loop=args.loop,
-        start_paused=args.start_paused,
-        topics=topic_names(args.topics),
-        exclude=topic_names(args.exclude),
-        publish_clock=not args.no_clock,
-        delay_s=args.delay,
-        wait_for=args.wait_for,
-        force=args.force,
-    )
-    for remap in args.remap:
-        words += ["-r", remap]
-    return run_node(node_class("bag_player"), words)
+    return _run("bag_player", args, True, *(word for remap in args.remap for word in ("-r", remap)))
+
+
+def _run(node: str, args: argparse.Namespace, use_sim_time: bool, *words: str) -> int:
+    """Run a node in this process with the arguments that have the name of a parameter."""
+    found = node_class(node)
+    names = {field.name for field in dataclasses.fields(found.config_class())}
+    given = {name: value for name, value in vars(args).items() if name in names} | {"use_sim_time": use_sim_time}
+    # JSON is valid YAML.
+    parameters = [word for name, value in given.items() for word in ("-p", f"{name}:={json.dumps(value)}")]
+    return run_node(found, ["--name", f"{node}_{os.getpid()}", *parameters, *words])
 
 
 def snapshot(args: argparse.Namespace) -> int:
@@ -124,12 +100,3 @@ def _node(kinds: tuple[str, ...], name: str, *, keeps_snapshots: bool = False) -
         others = f" (running: {', '.join(node.name for node in running)})" if running else ""
         raise UserError(f"no {what}{f' named {name}' if name else ''} runs in {run_dir()}{others}")
     raise UserError(f"several are running, choose one with --node: {', '.join(node.name for node in chosen)}", 2)
-
-
-def _megabytes(size: int) -> int:
-    return max(1, size // 1_000_000)
-
-
-def _parameters(**values: Any) -> list[str]:
-    """Return parameter arguments for a node's command line (JSON is valid YAML)."""
-    return [word for key, value in values.items() for word in ("-p", f"{key}:={json.dumps(value)}")]

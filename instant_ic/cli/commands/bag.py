@@ -25,45 +25,48 @@ def add_parser(subparsers: Any) -> None:
 
 
 def _add_record(verbs: Any) -> None:
-    """Add ``ic bag record``."""
-    example = "ic bag record -o drive /scan '/camera/*' -x /camera/raw --max-bag-size 2GB"
-    recording = verb(verbs, "record", "record topics until Ctrl-C", "bag_run.record", example)
+    """Add ``ic bag record``; its options are parameters of the node."""
+    text, example = "record topics until Ctrl-C", "ic bag record -o drive /scan '/camera/*' -x /camera/raw"
+    recording = verb(verbs, "record", text, "bag_run.record", f"{example} --max-bag-size 2GB", **_ONLY_GIVEN)
     _topics(recording)
     add = recording.add_argument
-    add("-o", "--output", default="", metavar="DIR", help="default: runs/bag_DATE_TIME")
-    add("--duration", **_SPAN, default=0.0, help="stop after this time")
-    _files(recording)
+    add("-o", "--output", dest="path", metavar="DIR", help="default: runs/bag_DATE_TIME")
+    add("--duration", **_SPAN, dest="duration_s", help="stop after this time")
+    add("-b", "--max-bag-size", type=size, metavar="SIZE", help="split files at 500MB, 2GB, ...")
+    add("-d", "--max-bag-duration", **_SPAN, help="split files at this time")
+    add("--compression", dest="compressed", action="store_true", help="compress with zstd")
     text = "size of the queue for the disk (default: 256MB); messages beyond it are dropped and counted"
-    add("--max-queue", type=size, default=256_000_000, metavar="SIZE", help=text)
+    add("--max-queue", **_MEGABYTES, dest="queue_mb", help=text)
     text = "pause writing below this free disk space (default: 100MB)"
-    add("--min-free", type=size, default=100_000_000, metavar="SIZE", help=text)
+    add("--min-free", **_MEGABYTES, dest="min_free_mb", help=text)
     text = "keep the last seconds in memory and write them on ic bag snapshot or an emergency stop"
     add("--snapshot", action="store_true", help=text)
-    add("--snapshot-seconds", **_SPAN, default=30.0, help="seconds kept in memory (default: 30)")
-    add("--snapshot-after", **_SPAN, default=2.0, help="seconds to include after the snapshot (default: 2)")
+    add("--snapshot-seconds", **_SPAN, help="seconds kept in memory (default: 30)")
+    text = "seconds to include after the snapshot (default: 2)"
+    add("--snapshot-after", **_SPAN, dest="snapshot_after_s", help=text)
     text = "memory limit for a snapshot (default: 256MB)"
-    add("--max-cache-size", type=size, default=256_000_000, metavar="SIZE", help=text)
+    add("--max-cache-size", **_MEGABYTES, dest="max_cache_mb", help=text)
     add("--use-sim-time", action="store_true", help="stamp messages with /clock, for example from a playing bag")
 
 
 def _add_play(verbs: Any) -> None:
-    """Add ``ic bag play``."""
-    text, example = "play a bag with /clock", "ic bag play drive --rate 2"
-    playing = verb(verbs, "play", text, "bag_run.play", f"{example} --start 10")
+    """Add ``ic bag play``; its options are parameters of the node."""
+    text, example = "play a bag with /clock", "ic bag play drive --rate 2 --start 10"
+    playing = verb(verbs, "play", text, "bag_run.play", example, **_ONLY_GIVEN)
     add = playing.add_argument
     add("bag", metavar="BAG", help="folder, .mcap or .db3 file")
     _topics(playing)
-    add("-r", "--rate", type=float, default=1.0, help="speed factor (default: %(default)s)")
-    add("--start", **_SPAN, default=0.0, help="start at this offset")
-    add("--duration", **_SPAN, default=0.0, help="play this many seconds")
+    add("-r", "--rate", type=float, help="speed factor (default: 1)")
+    add("--start", **_SPAN, dest="start_offset_s", help="start at this offset")
+    add("--duration", **_SPAN, dest="duration_s", help="play this many seconds")
     add("--loop", action="store_true", help="restart at the end")
     add("--start-paused", action="store_true", help="wait for ic bag control resume")
     add("--remap", **_MANY, metavar="FROM:=TO", help="rename a topic; repeatable")
     text = "publish commands and states even though a base is running: the robot may move"
     add("--force", action="store_true", help=text)
-    add("--no-clock", action="store_true", help="do not publish /clock")
-    add("--delay", **_SPAN, default=0.5, help="wait for subscribers to connect (default: 0.5)")
-    add("--wait-for", **_MANY, metavar="NODE", help="start once this node subscribes; repeatable")
+    add("--no-clock", dest="publish_clock", action="store_false", help="do not publish /clock")
+    add("--delay", **_SPAN, dest="delay_s", help="wait for subscribers to connect (default: 0.5)")
+    add("--wait-for", action="append", metavar="NODE", help="start once this node subscribes; repeatable")
 
 
 def _add_inspection(verbs: Any) -> None:
@@ -111,7 +114,7 @@ def tolerances(parser: argparse.ArgumentParser) -> None:
     """Add the tolerance options of a comparison."""
     add: Any = parser.add_argument
     many: dict[str, Any] = {"action": "append", "default": []}
-    add("--ignore", **many, metavar="TOPIC", help="topics to ignore: name or pattern")
+    add("--ignore", **many, type=topic_name, metavar="TOPIC", help="topics to ignore: name or pattern")
     add("--atol", type=_seconds, default=0.0, metavar="X", help="absolute tolerance of numbers")
     text = "absolute tolerance of a field: ranges=0.01, /pose:pose.covariance=1e-6; repeatable"
     add("--tolerance", **many, metavar="FIELD=X", help=text)
@@ -121,15 +124,9 @@ def tolerances(parser: argparse.ArgumentParser) -> None:
 
 
 def _topics(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("topics", nargs="*", metavar="TOPIC", help="names or patterns; default: everything")
-    parser.add_argument("-x", "--exclude", action="append", default=[], metavar="TOPIC", help="topics to leave out")
-
-
-def _files(parser: argparse.ArgumentParser) -> None:
-    add = parser.add_argument
-    add("-b", "--max-bag-size", type=size, default=0, metavar="SIZE", help="split files at 500MB, 2GB, ...")
-    add("-d", "--max-bag-duration", type=_seconds, default=0.0, metavar="S", help="split files at this time")
-    add("--compression", action="store_true", help="compress with zstd")
+    add: Any = parser.add_argument
+    add("topics", nargs="*", type=topic_name, metavar="TOPIC", help="names or patterns; default: everything")
+    add("-x", "--exclude", action="append", type=topic_name, metavar="TOPIC", help="topics to leave out")
 
 
 def size(text: str) -> int:
@@ -154,9 +151,13 @@ def _seconds(text: str) -> float:
     return value
 
 
-def topic_names(names: list[str]) -> list[str]:
-    """Return topic names with their leading slash, which is optional on the command line."""
-    return [name if name.startswith(("/", "*")) else f"/{name}" for name in names]
+def _megabytes(text: str) -> int:
+    return size(text) // 1_000_000
+
+
+def topic_name(name: str) -> str:
+    """Return a topic's name with its leading slash, which is optional on the command line."""
+    return name if name.startswith(("/", "*")) else f"/{name}"
 
 
 def pairs(words: list[str], separator: str, option: str) -> dict[str, str]:
@@ -191,4 +192,7 @@ def argument_of(command: str, value: float | None) -> dict[str, Any]:
 
 
 _SPAN: dict[str, Any] = {"type": _seconds, "metavar": "S"}
+_MEGABYTES: dict[str, Any] = {"type": _megabytes, "metavar": "SIZE"}
+_ONLY_GIVEN: dict[str, Any] = {"argument_default": argparse.SUPPRESS}
+"""Leave the defaults to the node."""
 _MANY: dict[str, Any] = {"action": "append", "default": []}

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from instant_ic.cli.arguments import verb
-from instant_ic.cli.commands.bag import tolerances, topic_names
+from instant_ic.cli.commands.bag import tolerances
 from instant_ic.cli.errors import UserError
 
 
@@ -71,7 +71,7 @@ def run(args: argparse.Namespace) -> int:
     print(f"{result.bag_s:.1f} s of bag in {took}")
     if not args.compare:
         return 0
-    found = compare(Path(args.output), Path(args.compare), tuple(topic_names(args.ignore)), True, tolerance)
+    found = compare(Path(args.output), Path(args.compare), tuple(args.ignore), True, tolerance)
     if not found:
         raise UserError(f"{args.output} and {args.compare} have no topic in common")
     return print_differences(found)
