@@ -122,10 +122,9 @@ class CrawlerBaseNode(Node[CrawlerBaseConfig]):
         """Publish the result of a controller step, the odometry at once; called on the serial thread."""
         # Without the node's thread no command arrives: the arbiter must see this as the loss of the base.
         if state.odometry is not None and self.clock.steady_ns() - self.stepped_ns <= BRIEF_S * 1e9:
-            message = estimate_message(state.odometry, self.config.odom_frame, self.config.base_frame)
-            self.odometry.publish(message)
+            self.odometry.publish(estimate_message(state.odometry))
             matrix, stamp = matrix_from_pose2(state.odometry.pose), state.odometry.stamp_ns
-            self.transforms.broadcast(self.config.odom_frame, self.config.base_frame, matrix, stamp)
+            self.transforms.broadcast("odom", "base_link", matrix, stamp)
         changed, self.status = state.status != self.status, state.status
         if state.link or state.fault or changed or state.health is not None:
             self.call_soon(self.on_state, state)
@@ -154,7 +153,7 @@ class CrawlerBaseNode(Node[CrawlerBaseConfig]):
     def publish_health(self, health: Health) -> None:
         """Publish the battery message."""
         charge = self.report.charge(health)
-        self.battery.publish(battery_message(health.battery_v, charge, self.config.base_frame, health.stamp_ns))
+        self.battery.publish(battery_message(health.battery_v, charge, "base_link", health.stamp_ns))
         self.diagnose_all(self.report.battery(health))
 
     def press(self, pressed: bool) -> None:

@@ -97,7 +97,7 @@ class DepthScalerNode(Node[DepthScalerConfig]):
     def on_local_map(self) -> None:
         mapper = self.chain.metric.mapper
         if self.local_map.subscriber_count and mapper.model.revolutions:
-            self.local_map.publish(cloud_of_points(mapper.cloud(), self.config.map_frame, self.chain.image_ns))
+            self.local_map.publish(cloud_of_points(mapper.cloud(), "map", self.chain.image_ns))
 
     def on_depth(self, message: Any) -> None:
         if self.config.source != "lidar":
@@ -129,7 +129,7 @@ class DepthScalerNode(Node[DepthScalerConfig]):
         if pose is None:
             return
         panorama, count = self.chain.inputs.images[image.stamp_ns], self.chain.selector.count
-        self.keyframe.publish(keyframe_message(count, self.config.map_frame, pose, panorama, result))
+        self.keyframe.publish(keyframe_message(count, "map", pose, panorama, result))
         text, level = f"keyframe {count}: {result.message}", OK if result.ok else WARN
         before = self.diagnoses().get("keyframe", (OK,))[0]
         self.diagnose("keyframe", level, text, id=count)

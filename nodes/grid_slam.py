@@ -80,7 +80,7 @@ class GridSlamNode(Node[GridSlamConfig]):
             if back_s > 0:
                 self.diagnose("time", WARN, f"time went back by {back_s:.1f} s: a new map begins")
                 self.restart()
-            scan, mount = slam_messages.read_scan(message, self.mounts, self.config.base_frame)
+            scan, mount = slam_messages.read_scan(message, self.mounts)
             self.queue.add(scan, mount, now_ns, self.clock.steady_ns())
         except ScanError as error:
             self.queue.drop(str(error))
@@ -103,11 +103,11 @@ class GridSlamNode(Node[GridSlamConfig]):
         result = slam.process(queued.scan, odometry, queued.base_from_laser)
         self.diagnose_all(*diagnoses(slam, result, odometry is not None, config.use_wheel_odom))
         self.placed_ns = stamp
-        self.integrity_out.publish(slam_messages.integrity_message(slam, result, config.map_frame, stamp))
-        for parent, child, matrix in slam_messages.transforms(slam, self.limiter, config, stamp, odometry is not None):
+        self.integrity_out.publish(slam_messages.integrity_message(slam, result, stamp))
+        for parent, child, matrix in slam_messages.transforms(slam, self.limiter, stamp, odometry is not None):
             self.transforms.broadcast(parent, child, matrix, stamp)
         if slam.in_map_frame:
-            self.pose_out.publish(slam_messages.pose_message(result, config.map_frame, stamp))
+            self.pose_out.publish(slam_messages.pose_message(result, stamp))
             if self.updates.grid is None:
                 self.publish_map()
         job = slam.background_job()
@@ -123,7 +123,7 @@ class GridSlamNode(Node[GridSlamConfig]):
     def on_initial_pose(self, message: Any) -> None:
         """Set the robot's pose in the saved map from outside (RViz's "2D pose estimate")."""
         try:
-            self.slam.set_pose(slam_messages.read_initial_pose(message, self.config.map_frame))
+            self.slam.set_pose(slam_messages.read_initial_pose(message))
             self.limiter.reset()
         except ValueError as error:
             self.log.warning("/initialpose is not used: %s", error)
@@ -138,8 +138,8 @@ class GridSlamNode(Node[GridSlamConfig]):
         """Publish a changed map: in parts on /map_updates, whole at most every ``map_full_period_s``."""
         if self.placed_ns is None:
             return
-        which = self.updates, self.slam, self.config.map_frame, self.placed_ns
-        update, grid = slam_messages.map_messages(*which, self.clock.steady_ns())
+        steady_ns = self.clock.steady_ns()
+        update, grid = slam_messages.map_messages(self.updates, self.slam, self.placed_ns, steady_ns)
         if update is not None:
             self.update_out.publish(update)
         if grid is not None:

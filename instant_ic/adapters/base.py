@@ -50,11 +50,11 @@ def read_command(received: Received) -> BaseCommand:
     return BaseCommand(*twist_values(message), stamp, received.given_ns(stamp) if stamp else received.steady_ns, hard)
 
 
-def estimate_message(estimate: OdometryEstimate, odom_frame: str, base_frame: str) -> Any:
+def estimate_message(estimate: OdometryEstimate) -> Any:
     """Return the odometry of an estimate."""
     v, lateral, w = (float(part) for part in estimate.twist)
     covariances = (estimate.pose_covariance, estimate.twist_covariance)
     odom_from_base = matrix_from_pose2(estimate.pose)
-    message = odometry_message(odom_from_base, v, w, odom_frame, base_frame, estimate.stamp_ns, *covariances)
+    message = odometry_message(odom_from_base, v, w, "odom", "base_link", estimate.stamp_ns, *covariances)
     message.twist.twist.linear.y = lateral
     return message

@@ -25,7 +25,6 @@ from instant_ic.msg import (
 )
 from instant_ic.msg import pose_message as _pose
 from instant_ic.slam import GridSlam, Scan
-from instant_ic.slam.config import GridSlamConfig
 from instant_ic.slam.grid_slam import SlamResult
 from instant_ic.slam.localization import FoundPlace
 from instant_ic.slam.loop_closure import LoopOutcome
@@ -36,7 +35,7 @@ from instant_ic.slam.scan_queue import ScanError, level_mount
 from instant_ic.util.diagnosis import Diagnosis, Level
 
 
-def read_scan(message: LaserScan, mounts: TransformBuffer, base_frame: str) -> tuple[Scan, FloatArray]:
+def read_scan(message: LaserScan, mounts: TransformBuffer) -> tuple[Scan, FloatArray]:
     """Return the scan of a LaserScan, and the laser's planar mount (3,) on the robot.
 
     Raises:
@@ -45,7 +44,7 @@ def read_scan(message: LaserScan, mounts: TransformBuffer, base_frame: str) -> t
     angles = (float(message.angle_min), float(message.angle_increment))
     limits = (float(message.range_min), float(message.range_max))
     try:
-        mount = level_mount(mounts.lookup(base_frame, message.header.frame_id))
+        mount = level_mount(mounts.lookup("base_link", message.header.frame_id))
         return Scan(np.asarray(message.ranges), *angles, *limits, stamp_ns(message)), mount
     except TransformError as error:
         raise ScanError(f"the laser's mount is not known yet: {error}") from None
@@ -53,11 +52,11 @@ def read_scan(message: LaserScan, mounts: TransformBuffer, base_frame: str) -> t
         raise ScanError(f"the scan cannot be used: {error}") from None
 
 
-def integrity_message(slam: GridSlam, result: SlamResult, map_frame: str, stamp: int) -> Any:
+def integrity_message(slam: GridSlam, result: SlamResult, stamp: int) -> Any:
     """Return the PoseIntegrity after a scan with this result."""
     trust, found = result.integrity, slam.contradiction
     return PoseIntegrity(
-        header=header(map_frame, stamp),
+        header=header("map", stamp),
         lost_probability=trust.lost_probability,
         position_bound_m=trust.position_bound_m,
         heading_bound_rad=trust.heading_bound_rad,
@@ -68,11 +67,11 @@ def integrity_message(slam: GridSlam, result: SlamResult, map_frame: str, stamp:
     )
 
 
-def pose_message(result: SlamResult, map_frame: str, stamp: int) -> Any:
+def pose_message(result: SlamResult, stamp: int) -> Any:
     """Return the PoseWithCovarianceStamped after a scan."""
     covariance = planar_covariance(result.covariance).reshape(36)
     pose = PoseWithCovariance(pose=_pose(matrix_from_pose2(result.map_from_base)), covariance=covariance)
-    return PoseWithCovarianceStamped(header=header(map_frame, stamp), pose=pose)
+    return PoseWithCovarianceStamped(header=header("map", stamp), pose=pose)
 
 
 def read_mounts(message: TFMessage, mounts: TransformBuffer) -> None:
@@ -82,28 +81,28 @@ def read_mounts(message: TFMessage, mounts: TransformBuffer) -> None:
         mounts.set(parent, child, stamp_ns(mount), transform_matrix(mount), static=True)
 
 
-def read_initial_pose(message: PoseWithCovarianceStamped, map_frame: str) -> FloatArray:
+def read_initial_pose(message: PoseWithCovarianceStamped) -> FloatArray:
     """Return the pose (3,) that was set from outside.
 
     Raises:
         ValueError: it is in another frame than the map's.
     """
-    if message.header.frame_id not in ("", map_frame):
-        raise ValueError(f"it is in frame {message.header.frame_id!r}, not {map_frame!r}")
+    if message.header.frame_id not in ("", "map"):
+        raise ValueError(f"it is in frame {message.header.frame_id!r}, not 'map'")
     return pose2_from_message(message)
 
 
-def map_messages(updates: MapUpdates, slam: GridSlam, map_frame: str, stamp: int, steady_ns: int) -> tuple[Any, Any]:
+def map_messages(updates: MapUpdates, slam: GridSlam, stamp: int, steady_ns: int) -> tuple[Any, Any]:
     """Return the changed part (OccupancyGridUpdate) and the whole map (OccupancyGrid); None for what is not due."""
     part, whole = updates.update(slam.map_version, slam.grid, steady_ns)
     update = grid = None
     if part is not None:
         (height, width), data = part.values.shape, np.ascontiguousarray(part.values).reshape(-1)
         place = {"x": part.x, "y": part.y, "width": width, "height": height}
-        update = OccupancyGridUpdate(header=header(map_frame, stamp), data=data, **place)
+        update = OccupancyGridUpdate(header=header("map", stamp), data=data, **place)
     if whole is not None:
         origin = (float(whole.origin[0]), float(whole.origin[1]))
-        grid = grid_message(whole.values, whole.resolution, origin, map_frame, stamp)
+        grid = grid_message(whole.values, whole.resolution, origin, "map", stamp)
     return update, grid
 
 
@@ -116,15 +115,15 @@ def save_answer(slam: GridSlam, stem: Path) -> str:
 
 
 def transforms(
-    slam: GridSlam, limiter: CorrectionLimiter, config: GridSlamConfig, stamp_ns: int, with_odometry: bool
+    slam: GridSlam, limiter: CorrectionLimiter, stamp_ns: int, with_odometry: bool
 ) -> Iterator[tuple[str, str, Matrix]]:
     """Yield the transforms to broadcast after a scan: parent, child and parent_from_child (4, 4)."""
     if not with_odometry:
-        yield config.odom_frame, config.base_frame, matrix_from_pose2(slam.odom_from_base)
+        yield "odom", "base_link", matrix_from_pose2(slam.odom_from_base)
     # A robot that is lost keeps the frames that it had: it may drive on, slowly, until its place is recognized.
     if slam.in_map_frame:
         map_from_odom = limiter.follow(slam.map_from_odom, slam.odom_from_base, stamp_ns)
-        yield config.map_frame, config.odom_frame, matrix_from_pose2(map_from_odom)
+        yield "map", "odom", matrix_from_pose2(map_from_odom)
     else:
         limiter.reset()
 

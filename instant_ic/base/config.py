@@ -116,8 +116,6 @@ class CrawlerBaseConfig(ControllerConfig):
 
     Attributes:
         rate_hz: commands and odometry messages per second.
-        odom_frame: parent of the base's frame.
-        base_frame: the base's own frame.
         battery_full_v: main battery when full, volts.
         battery_empty_v: voltage of the main battery when it needs charging, volts; lower voltages warn.
         recent_s: seconds for which repeats, dropped commands and impossible readings remain a warning.
@@ -127,8 +125,6 @@ class CrawlerBaseConfig(ControllerConfig):
     """
 
     rate_hz: Annotated[float, Range(5, 200)] = 30.0
-    odom_frame: str = "odom"
-    base_frame: str = "base_link"
     battery_full_v: Annotated[float, Plausible(3, 100)] = 25.2
     battery_empty_v: Annotated[float, Plausible(3, 100)] = 21.0
     recent_s: Annotated[float, Plausible(1, 600)] = 10.0

@@ -3,7 +3,7 @@
 File form::
 
     /**:
-      ros__parameters: {base_frame: base_link}   # every node that has such a parameter
+      ros__parameters: {rate_hz: 20.0}           # every node that has such a parameter
     grid_slam:
       ros__parameters:
         resolution: 0.05                         # metres

@@ -32,8 +32,6 @@ class DepthScalerConfig(SourceConfig):
             depth_estimator's.
         rows: height of the depth image of source ``lidar``; the others have the network's.
         body_elevation_deg: below this elevation the image shows the robot itself, not the room; -90: nowhere.
-        map_frame, odom_frame: frames of the keyframe's pose and of the motion compensation.
-        base_frame: frame on the ground; reference of the camera's height.
     """
 
     source: str = "completed"
@@ -45,9 +43,6 @@ class DepthScalerConfig(SourceConfig):
     max_rate_hz: Positive = 2.0
     rows: Annotated[int, Range(32, 1024)] = 256
     body_elevation_deg: Annotated[float, Range(-90, 0)] = -70.0
-    map_frame: str = "map"
-    odom_frame: str = "odom"
-    base_frame: str = "base_link"
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -67,15 +62,14 @@ class MetricDepth:
     def __init__(self, config: DepthScalerConfig, transforms: TransformBuffer, inputs: RecentInputs) -> None:
         self.config, self.transforms, self.inputs = config, transforms, inputs
         self.source = DepthSource(config)
-        self.mapper = LocalMapper(transforms, config.mapping, config.map_frame, config.odom_frame)
+        self.mapper = LocalMapper(transforms, config.mapping)
 
     def reconfigure(self, config: DepthScalerConfig) -> None:
         """Apply new parameters; the local model starts again if they change it."""
         before, self.config = self.config, config
         self.source.configure(config)
-        keys = ("mapping", "map_frame", "odom_frame")
-        if any(getattr(before, key) != getattr(config, key) for key in keys):
-            self.mapper = LocalMapper(self.transforms, config.mapping, config.map_frame, config.odom_frame)
+        if before.mapping != config.mapping:
+            self.mapper = LocalMapper(self.transforms, config.mapping)
 
     def estimate(self, raw: NDArray[np.float32] | None, camera: str, stamp_ns: int) -> DepthResult:
         """Depth of an image; if something is missing the result is not ok, and its message says what.
@@ -108,8 +102,8 @@ class MetricDepth:
         Raises:
             TransformError: the poses are not known.
         """
-        base_from_camera = self.transforms.lookup(self.config.base_frame, camera, stamp_ns)
-        odom_from_camera = self.transforms.lookup(self.config.odom_frame, camera, stamp_ns)
+        base_from_camera = self.transforms.lookup("base_link", camera, stamp_ns)
+        odom_from_camera = self.transforms.lookup("odom", camera, stamp_ns)
         return np.array(odom_from_camera[2, :3]), float(base_from_camera[2, 3])
 
     def points_in_camera(self, camera: str, stamp_ns: int) -> NDArray[np.float64] | None:
@@ -121,11 +115,10 @@ class MetricDepth:
         revolution = self.inputs.nearest_revolution(stamp_ns)
         if revolution is None:
             return None
-        odom, lidar = self.config.odom_frame, revolution.frame
-        camera_from_odom = self.transforms.lookup(camera, odom, stamp_ns)
+        lidar, camera_from_odom = revolution.frame, self.transforms.lookup(camera, "odom", stamp_ns)
 
         def camera_from_lidar(at_ns: int) -> Matrix:
-            return camera_from_odom @ self.transforms.lookup(odom, lidar, at_ns)
+            return camera_from_odom @ self.transforms.lookup("odom", lidar, at_ns)
 
         return points_at(revolution.xyz(), revolution.time_s, revolution.stamp_ns, camera_from_lidar)
 
@@ -136,6 +129,4 @@ class MetricDepth:
         Raises:
             TransformError: the poses are not known.
         """
-        map_frame, odom_frame = self.config.map_frame, self.config.odom_frame
-        map_from_odom = correction(self.transforms, map_frame, odom_frame, stamp_ns)
-        return map_from_odom @ self.transforms.lookup(odom_frame, camera, stamp_ns)
+        return correction(self.transforms, stamp_ns) @ self.transforms.lookup("odom", camera, stamp_ns)

@@ -73,16 +73,10 @@ class LocalMapper:
     Args:
         transforms: poses over time.
         config: parameters.
-        map_frame: frame of the map; odometry alone is used while it is not known.
-        odom_frame: frame of the odometry.
     """
 
-    def __init__(
-        self, transforms: TransformBuffer, config: MapperConfig | None = None, map_frame: str = "map",
-        odom_frame: str = "odom",
-    ) -> None:  # fmt: skip
-        self.transforms, self.map_frame, self.odom_frame = transforms, map_frame, odom_frame
-        self.config = config or MapperConfig()
+    def __init__(self, transforms: TransformBuffer, config: MapperConfig | None = None) -> None:
+        self.transforms, self.config = transforms, config or MapperConfig()
         self.model = LocalModel(self.config.model)
         self.clear()
 
@@ -118,7 +112,7 @@ class LocalMapper:
     def _add(self, revolution: TimedPoints) -> None:
         """Add a revolution if the robot has moved or enough time has passed."""
         frame, stamp_ns, middle_ns = revolution.frame, revolution.stamp_ns, revolution.middle_ns
-        odom_from_lidar = self.transforms.lookup(self.odom_frame, frame, middle_ns)
+        odom_from_lidar = self.transforms.lookup("odom", frame, middle_ns)
         moved_m, turned_rad = math.inf, math.inf
         if self._taken_at is not None and self._taken_ns is not None:
             moved_m = float(np.linalg.norm(odom_from_lidar[:3, 3] - self._taken_at[:3, 3]))
@@ -150,11 +144,11 @@ class LocalMapper:
 
     def _map_from(self, frame: str, stamp_ns: int) -> Matrix:
         """Return the pose of a sensor in the map at a time; by odometry alone if there is no map."""
-        return self._correction(stamp_ns) @ self.transforms.lookup(self.odom_frame, frame, stamp_ns)
+        return self._correction(stamp_ns) @ self.transforms.lookup("odom", frame, stamp_ns)
 
     def _correction(self, stamp_ns: int) -> Matrix:
         try:
-            return correction(self.transforms, self.map_frame, self.odom_frame, stamp_ns)
+            return correction(self.transforms, stamp_ns)
         except TransformError:
             return np.eye(4) if self._reference is None else self._reference[1]
 
@@ -167,9 +161,9 @@ class LocalMapper:
         map_from_odom = self._correction(stamp_ns)
         if self._reference is not None:
             reference_ns, before = self._reference
-            odom_from_sensor = self.transforms.lookup(self.odom_frame, frame, stamp_ns)
+            odom_from_sensor = self.transforms.lookup("odom", frame, stamp_ns)
             try:
-                start = self.transforms.lookup(self.odom_frame, frame, reference_ns)
+                start = self.transforms.lookup("odom", frame, reference_ns)
             except TransformError:  # too long ago
                 start = odom_from_sensor
             moved_m = float(np.linalg.norm(odom_from_sensor[:3, 3] - start[:3, 3]))
@@ -217,16 +211,16 @@ class LocalView:
         return self.model.render(self.model_from_camera, size, over_floor)
 
 
-def correction(transforms: TransformBuffer, map_frame: str, odom_frame: str, stamp_ns: int) -> Matrix:
+def correction(transforms: TransformBuffer, stamp_ns: int) -> Matrix:
     """Return the pose of odometry in the map at a time, or the newest if that time is not covered.
 
     Raises:
         TransformError: there is none.
     """
     try:
-        return transforms.lookup(map_frame, odom_frame, stamp_ns)
+        return transforms.lookup("map", "odom", stamp_ns)
     except TransformError:
-        return transforms.lookup(map_frame, odom_frame)
+        return transforms.lookup("map", "odom")
 
 
 def _angle(first: Matrix, second: Matrix) -> float:

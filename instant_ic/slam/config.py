@@ -93,18 +93,12 @@ class GridSlamConfig(SlamConfig, QueueConfig):
     Attributes:
         mode: mapping: make a map, or extend map_file; localization: only localise in map_file.
         map_file: saved map, NAME or NAME.yaml ("ic map save NAME"); empty: start a new map.
-        map_frame: frame of /map and /pose.
-        odom_frame: frame of the odometry; corrections are published as map_frame → odom_frame.
-        base_frame: frame of the robot, on the ground.
         map_period_s: minimum period of /map_updates, which holds the changed part of the map.
         map_full_period_s: minimum period of /map (whole map); raise it for slow links with /map_updates.
     """
 
     mode: Literal["mapping", "localization"] = "mapping"
     map_file: str = ""
-    map_frame: str = "map"
-    odom_frame: str = "odom"
-    base_frame: str = "base_link"
     map_period_s: Positive = 1.0
     map_full_period_s: Positive = 1.0
 

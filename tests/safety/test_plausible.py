@@ -162,18 +162,18 @@ STACK = """launch:
 TOGETHER = [
     (
         "limits: {max_linear_m_s: 0.4}",
-        "odom_frame: odom",
+        "rate_hz: 30.0",
         "node crawler_base: limits.max_linear_m_s is 0.5, but 0.4 in",
     ),
-    ("footprint: {width_m: 0.3}", "odom_frame: odom", "geometry.track_width must be within footprint.width_m 0.3"),
-    ("rate_hz: 5", "odom_frame: odom", "crawler_base: command_timeout_s must span 2 messages of arbiter: 0.4 s"),
-    ("collision_monitor: {blind_radius_m: 0.3}", "odom_frame: odom", "vlp16_driver: decoder.min_range must be at most"),
+    ("footprint: {width_m: 0.3}", "rate_hz: 30.0", "geometry.track_width must be within footprint.width_m 0.3"),
+    ("rate_hz: 5", "rate_hz: 30.0", "crawler_base: command_timeout_s must span 2 messages of arbiter: 0.4 s"),
+    ("collision_monitor: {blind_radius_m: 0.3}", "rate_hz: 30.0", "vlp16_driver: decoder.min_range must be at most"),
     (
         "timeouts: {stop_after_s: 1.0}",
-        "odom_frame: odom",
+        "rate_hz: 30.0",
         "node console: server.drive.stop_after_s must be at most the arbiter's timeouts.stop_after_s = 1.0 s",
     ),
-    ("timeouts: {command: 0.05}", "odom_frame: odom", "timeouts.command must span 2 messages of console"),
+    ("timeouts: {command: 0.05}", "rate_hz: 30.0", "timeouts.command must span 2 messages of console"),
 ]
 
 
