@@ -5,9 +5,9 @@ from __future__ import annotations
 import math
 import threading
 import time
-from dataclasses import dataclass, field
 from typing import Any
 
+import cv2
 import demo_world
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from instant_ic.console.backend import ConsoleBackend
 from instant_ic.console.config import ConsoleServerConfig
 from instant_ic.console.gridimage import grid_image
-from instant_ic.console.protocol import FrameKind, PendingFrame
+from instant_ic.console.protocol import FrameKind
 from instant_ic.console.recording import RecorderError, RecordingDesk
 from instant_ic.console.server import ConsoleServer
 from instant_ic.console.view import PROBE_HZ, Look, ViewConfig, view_shape
@@ -27,22 +27,13 @@ STEP_S = 0.05
 Pose = NDArray[np.float64]
 
 
-@dataclass(frozen=True)
-class DemoConfig:
-    """Sizes and rates of the synthetic images."""
-
-    panorama_width: int = 640
-    panorama_hz: float = 5.0
-    view: ViewConfig = field(default_factory=ViewConfig)
-
-
 class DemoRecorder:
     """Answers as a recorder would, and writes nothing."""
 
     def __init__(self) -> None:
         self.missing = False
         self.state, self.error = "idle", ""
-        self.snapshots: list[dict[str, str]] = []
+        self.snapshots = 0
         self._began_s = 0.0
 
     def ask(self, command: str, **arguments: Any) -> Any:
@@ -55,50 +46,49 @@ class DemoRecorder:
         elif command == "stop":
             self.state = "idle"
         elif command == "snapshot":
-            self.snapshots.append({"path": f"{path}_operator", "state": "done", "words": "demo: nothing is written"})
+            self.snapshots += 1
         seconds = time.monotonic() - self._began_s if self.state != "idle" else 0.0
         recording = {"state": self.state, "path": path, "seconds": round(seconds, 1), "bytes": int(2e6 * seconds)}
         return {
             "path": path,
             "cached_s": 60.0,
-            "snapshots": self.snapshots,
             "recording": recording | {"error": self.error, "free_bytes": 50_000_000_000},
         }
 
 
 class Demo(ConsoleBackend):
-    """Backend with a simulated robot, and its server."""
+    """Backend with a simulated robot, and its server.
+
+    Args:
+        server_config: parameters of the server.
+        panorama_width: width of the camera's images, pixels.
+        view: size and rate of the rendered views.
+        page_values: further values for the page.
+    """
 
     def __init__(
-        self,
-        server_config: ConsoleServerConfig,
-        config: DemoConfig | None = None,
-        page_values: dict[str, float] | None = None,
+        self, server_config: ConsoleServerConfig, panorama_width: int, view: ViewConfig, page_values: dict[str, float]
     ) -> None:
-        self.config = config or DemoConfig()
+        self._view = view
         page = {"footprint": [0.6, 0.5], "camera": [0.0, 0.0, CAMERA_HEIGHT_M]}
-        self.server = ConsoleServer(self, server_config, page | (page_values or {}))
+        self.server = ConsoleServer(self, server_config, page | page_values)
         self.commands: list[tuple[float, float]] = []
         self.look = Look()
         self.estop = False
         self.button = False  # e-stop button on the robot
         self.forced_mode = "real"
         self.faults: list[dict[str, str]] = []
-        self.pace = ""
-        self.nodes = [{"name": "nerf", "cpu_percent": 12.0}]
         self.images = True
         self.tint = (1.0, 1.0, 1.0)  # gains of the rendered view: blue, green, red
-        self.version = 0
         self.mode = "real"
         self.reason = ""
         self.robot: Pose = np.zeros(3)
         self.vbot: Pose = np.zeros(3)
-        self.plan: dict[str, Any] = {"trajectory": [], "path": [], "subgoal": None}
-        self.costmap: PendingFrame | None = None
+        self.trajectory: list[list[float]] = []
         self._command = (0.0, 0.0)
         self.placing = threading.Lock()
         self._slow_due = 0.0
-        self._directions = equirect_directions(self.config.panorama_width, self.config.panorama_width // 2)
+        self._directions = equirect_directions(panorama_width, panorama_width // 2)
         self.panorama, self.panorama_camera = b"", np.zeros((4, 4))  # last panorama (JPEG) and its camera pose
         self.recorder = DemoRecorder()
         self._desk = RecordingDesk(self.recorder.ask, lambda status: self.server.publish("recording", status))
@@ -141,17 +131,17 @@ class Demo(ConsoleBackend):
     def stop(self) -> None:
         """Stop the server and the robot."""
         self._stop.set()
-        self._desk.stop()
         for thread in self._threads:
-            if thread.is_alive():
-                thread.join(timeout=5.0)
+            thread.join(timeout=5.0)
+        self._desk.stop()
         self.server.stop()
 
     def _move(self) -> None:
         last = time.monotonic()
         while not self._stop.wait(STEP_S):
             now = time.monotonic()
-            self.step(min(now - last, 0.2))
+            with self.placing:
+                self._step(min(now - last, 0.2))
             last = now
             self._publish_state()
 
@@ -160,9 +150,9 @@ class Demo(ConsoleBackend):
         while not self._stop.wait(0.01):
             now = time.monotonic()
             if now >= due and self.images:
-                due = now + 1.0 / self.config.panorama_hz
+                due = now + 0.25
                 self._send_panorama()
-            rate_hz = self.config.view.virtual_rate_hz if self.mode == "virtual" else PROBE_HZ
+            rate_hz = self._view.virtual_rate_hz if self.mode == "virtual" else PROBE_HZ
             if self.images and self.server.needs_views() and now >= view_due:
                 view_due = now + 1.0 / rate_hz
                 self._send_view()
@@ -171,8 +161,7 @@ class Demo(ConsoleBackend):
         """Send the layers round a keyframe at this pose (m, rad)."""
         from demo_layers import demo_layers  # takes seconds to import
 
-        self.version += 1
-        self.server.send_layers(demo_layers(self.version, _camera(keyframe)))
+        self.server.send_layers(demo_layers(1, _camera(keyframe)))
 
     def place(self, x: float, y: float, yaw: float) -> None:
         """Place both robots at this pose (m, rad)."""
@@ -181,15 +170,10 @@ class Demo(ConsoleBackend):
 
     def reset(self) -> None:
         """Restore the initial state, with the mode forced to REAL; for tests that share a demo."""
-        self.forced_mode, self.faults, self.images, self.pace = "real", [], True, ""
+        self.forced_mode, self.faults, self.images = "real", [], True
         self.recorder.missing, self.recorder.error, self.recorder.state = False, "", "idle"
         self.place(0.0, 0.0, 0.0)
         self.commands.clear()
-
-    def step(self, seconds: float) -> None:
-        """Advance both robots."""
-        with self.placing:
-            self._step(seconds)
 
     def _step(self, seconds: float) -> None:
         stopped = self.estop or self.button
@@ -210,7 +194,7 @@ class Demo(ConsoleBackend):
         elif self.mode == "real":
             self.robot = _moved(self.robot, v, w, seconds)
         shown = self.vbot if self.mode == "virtual" else self.robot
-        self.plan["trajectory"] = _ahead(shown, v, w, 3.0 * abs(v)).round(3).tolist() if v else []
+        self.trajectory = _ahead(shown, v, w, 3.0 * abs(v)).round(3).tolist() if v else []
 
     def _publish_state(self) -> None:
         now = time.monotonic()
@@ -233,14 +217,15 @@ class Demo(ConsoleBackend):
         if now >= self._slow_due:
             self._slow_due = now + 0.5
             self._publish_health()
-        self.server.publish("plan", self.plan)
+        self.server.publish("plan", {"trajectory": self.trajectory, "path": [], "subgoal": None})
 
     def _publish_health(self) -> None:
         vspace = {"state": "ready", "psnr_db": 27.4, "train_seconds": 9.0, "message": ""}
         vspace |= {"expected_psnr_db": 25.6, "unseen_share": 0.03, "radius_m": 2.0}
         battery = {"voltage": 24.6, "percent": 81.0}
-        health = {"vspace": vspace, "battery": battery, "faults": self.faults, "nodes": self.nodes, "pace": self.pace}
-        self.server.publish("health", health)
+        self.server.publish(
+            "health", {"vspace": vspace, "battery": battery, "faults": self.faults, "nodes": [], "pace": ""}
+        )
         self._desk.poll()
 
     def _send_panorama(self) -> None:
@@ -255,7 +240,7 @@ class Demo(ConsoleBackend):
     def _send_view(self) -> None:
         captured_ms = self.server.now_ms()
         look = self.look
-        fov_rad, width, height = view_shape(look, self.config.view)
+        fov_rad, width, height = view_shape(look, self._view)
         camera = _camera(self.vbot if self.mode == "virtual" else self.robot) @ look.rotation()
         directions = _turned(perspective_directions(width, height, fov_rad), camera)
         image = demo_world.shade(_position(camera), directions)
@@ -285,12 +270,7 @@ def _turned(directions: NDArray[np.float32], camera: NDArray[np.float64]) -> NDA
 
 
 def _jpeg(image: NDArray[np.uint8]) -> bytes:
-    import cv2
-
-    ok, data = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, 88])
-    if not ok:
-        raise ValueError(f"JPEG encoder failed on an image of shape {image.shape}")
-    return bytes(data.tobytes())
+    return cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, 88])[1].tobytes()
 
 
 def _moved(pose: Pose, v: float, w: float, seconds: float) -> Pose:

@@ -10,7 +10,7 @@ import cv2
 import demo_world
 import numpy as np
 import pytest
-from console_demo import Demo, DemoConfig
+from console_demo import Demo
 from console_servers import PATIENT
 
 from instant_ic.console.access import AccessConfig
@@ -43,11 +43,11 @@ BROWSER_TEST = [
 ]
 
 
-def make_demo(port=0, panorama_width=192, view_width=160, **access):
+def make_demo(port=0, panorama_width=192, view_width=160, page=None, **access):
     # No watchdog in the server's way: what stops the robot here must be the page.
     view = ViewConfig(width=view_width, height=view_width * 5 // 8, virtual_rate_hz=5)
-    config = DemoConfig(panorama_width=panorama_width, panorama_hz=4, view=view)
-    demo = Demo(ConsoleServerConfig(port=port, drive=PATIENT, access=AccessConfig(simulated=True, **access)), config)
+    config = ConsoleServerConfig(port=port, drive=PATIENT, access=AccessConfig(simulated=True, **access))
+    demo = Demo(config, panorama_width, view, page or {})
     demo.start()
     return demo
 

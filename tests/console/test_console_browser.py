@@ -17,6 +17,7 @@ from console_pages import (
     wait_alike,
     wait_until,
 )
+from console_servers import DRIVE, WATCH
 
 pytestmark = BROWSER_TEST
 
@@ -83,18 +84,12 @@ def test_picture_is_what_stands_in_the_look_direction(open_page, sharp_demo, mod
     assert likeness(page, room_seen(demo.robot, look.yaw + math.radians(10), look.pitch)) < 0.95
 
 
-def test_the_page_asks_for_a_token_and_a_watchers_has_nothing_to_drive_with(browser, tmp_path):
-    files = {}
-    for role in ("token_file", "watch_token_file"):
-        path = tmp_path / role
-        path.write_text(f"{role}-0123456789")
-        path.chmod(0o600)
-        files[role] = str(path)
+def test_the_page_asks_for_a_token_and_a_watchers_has_nothing_to_drive_with(browser, files):
     demo = make_demo(**files)
     try:
         contexts = [browser.new_context(viewport=SIZE) for _ in range(2)]
         driver, watcher = (context.new_page() for context in contexts)
-        for page, token in ((watcher, "watch_token_file-0123456789"), (driver, "token_file-0123456789")):
+        for page, token in ((watcher, WATCH), (driver, DRIVE)):
             page.set_default_timeout(WAIT_MS)
             page.goto(demo.server.url)
             page.get_by_label("Token").fill("wrong")

@@ -7,22 +7,17 @@ import math
 import cv2
 import numpy as np
 import pytest
-from console_demo import Demo, DemoConfig
 from console_pages import (
     BROWSER_TEST,
     WAIT_MS,
     expect_body,
     likeness,
+    make_demo,
     picture_of,
     room_seen,
     wait_alike,
     wait_until,
 )
-
-from instant_ic.console.access import AccessConfig
-from instant_ic.console.config import ConsoleServerConfig
-from instant_ic.console.drive import DriveConfig
-from instant_ic.console.view import ViewConfig
 
 pytestmark = BROWSER_TEST
 # Long enough that a slow machine draws several pictures of each passage.
@@ -43,27 +38,13 @@ WATCH = """
 """
 
 
-def passage_demo(**page_values):
-    view = ViewConfig(width=256, height=160, virtual_rate_hz=5)
-    drive = DriveConfig(lease_timeout_s=60.0)
-    config = DemoConfig(panorama_width=448, panorama_hz=4, view=view)
-    demo = Demo(
-        ConsoleServerConfig(port=0, drive=drive, access=AccessConfig(simulated=True)),
-        config,
-        SLOW_PASSAGE | page_values,
-    )
-    demo.forced_mode = "real"
-    demo.start()
-    return demo
-
-
 @pytest.fixture
 def passages():
     """Makes demos whose passages are slow."""
     demos = []
 
     def make(**page_values):
-        demos.append(passage_demo(**page_values))
+        demos.append(make_demo(panorama_width=448, view_width=256, page=SLOW_PASSAGE | page_values))
         return demos[-1]
 
     yield make
