@@ -16,7 +16,7 @@ from instant_ic.config.scalars import Scalar, is_null
 from instant_ic.config.yaml_place import YamlPlace
 from instant_ic.config.yaml_text import one_line, read_spelled
 from instant_ic.launch.description import HANG_TIMEOUT_S, NodeSpec
-from instant_ic.launch.substitutions import LaunchContext, SubstitutionError, substitute, truth
+from instant_ic.launch.substitutions import SubstitutionError, substitute, truth
 from instant_ic.util import paths
 
 NODE_NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
@@ -36,19 +36,22 @@ class Scope:
     """Settings of one file or group.
 
     Attributes:
-        context: variables and files of substitutions.
+        file: the launch file.
+        run_dir: run directory of the stack, or of its group.
+        variables: values of the arguments and ``let`` entries in scope.
         group: name of its run directory within the stack's; empty: the stack's own.
         options: ``--params-file`` arguments for each node.
     """
 
-    context: LaunchContext
+    file: Path
+    run_dir: Path
+    variables: dict[str, str] = field(default_factory=dict)
     group: str = ""
     options: list[str] = field(default_factory=list)
 
     def child(self) -> Scope:
         """Return a copy that can change independently."""
-        context = dataclasses.replace(self.context, variables=dict(self.context.variables))
-        return dataclasses.replace(self, context=context, options=list(self.options))
+        return dataclasses.replace(self, variables=dict(self.variables), options=list(self.options))
 
     def text(self, value: YamlPlace | None) -> str:
         """Return a value's text after substitution; empty if there is none."""
@@ -57,7 +60,7 @@ class Scope:
     def substituted(self, text: str, value: YamlPlace) -> str:
         """Return a text of this place after substitution."""
         try:
-            return substitute(text, self.context)
+            return substitute(text, self.variables, self.run_dir)
         except SubstitutionError as error:
             raise value.problem(str(error)) from None
 
@@ -101,7 +104,7 @@ def read_node(body: YamlPlace, scope: Scope) -> NodeSpec | None:
     fields = body.fields(_NODE_KEYS, required=("exec",))
     executable = scope.text(fields["exec"])
     name = scope.text(fields.get("name")) or Path(executable).stem
-    start = _program(fields["exec"], executable, scope.context)
+    start = _program(fields["exec"], executable, scope.file)
     if not NODE_NAME.fullmatch(name):
         raise body.problem(f"node name {name!r} is not legal: letters, digits and underscores only")
     options = ["--name", name, *scope.options]
@@ -120,7 +123,7 @@ def read_node(body: YamlPlace, scope: Scope) -> NodeSpec | None:
         required=scope.flag(fields.get("required")),
         file=body.file,
         line=body.line,
-        run_dir=scope.context.run_dir if scope.group else None,
+        run_dir=scope.run_dir if scope.group else None,
         group=scope.group,
         hang_timeout_s=scope.seconds(fields.get("hang_timeout"), HANG_TIMEOUT_S),
         places=places,
@@ -130,15 +133,15 @@ def read_node(body: YamlPlace, scope: Scope) -> NodeSpec | None:
 
 def parameter_file(value: YamlPlace, scope: Scope) -> list[str]:
     """Return the command-line arguments that pass a parameter file to a node."""
-    path = scope.context.launch_file.parent / scope.text(value)  # an absolute path replaces the folder
+    path = scope.file.parent / scope.text(value)  # an absolute path replaces the folder
     if not paths.is_file(path):
         raise value.problem(f"parameter file {path} does not exist")
     return ["--params-file", str(path)]
 
 
-def _program(value: YamlPlace, executable: str, context: LaunchContext) -> tuple[str, ...]:
+def _program(value: YamlPlace, executable: str, launch_file: Path) -> tuple[str, ...]:
     if executable.endswith(".py"):
-        file = context.launch_file.parent / executable
+        file = launch_file.parent / executable
         if not paths.is_file(file):
             raise value.problem(f"program {executable} does not exist beside the launch file")
         return (sys.executable, str(file.resolve()))

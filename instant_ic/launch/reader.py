@@ -5,13 +5,14 @@ The keys are those of ROS 2's YAML launch files, as far as they are supported; d
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
 from instant_ic.config.yaml_place import YamlPlace, YamlProblem, load
 from instant_ic.launch.description import LaunchArgument, LaunchDescription, LaunchFileError, NodeSpec, find_launch_file
 from instant_ic.launch.nodes import CONDITION, NODE_NAME, Scope, parameter_file, read_node
-from instant_ic.launch.substitutions import LaunchContext, truth
+from instant_ic.launch.substitutions import truth
 from instant_ic.util import paths
 
 _MAX_INCLUDE_DEPTH = 8
@@ -48,7 +49,7 @@ class _FileReader:
         Raises:
             YamlProblem: the file as a whole cannot be read.
         """
-        self._entries(load(scope.context.launch_file).fields(("launch",), ("launch",))["launch"], scope)
+        self._entries(load(scope.file).fields(("launch",), ("launch",))["launch"], scope)
 
     def _entries(self, body: YamlPlace, scope: Scope) -> None:
         for entry in body.items():
@@ -69,7 +70,7 @@ class _FileReader:
         value = self._given.get(argument.name)
         if value is None and argument.default is not None:
             value = scope.substituted(argument.default, body)
-        scope.context.variables[argument.name] = "0" if value is None or argument.type in ("int", "float") else ""
+        scope.variables[argument.name] = "0" if value is None or argument.type in ("int", "float") else ""
         if value is None:
             raise body.problem(f"argument {argument.name!r} has no default: give {argument.name}:=VALUE")
         if value or argument.default != "":
@@ -82,12 +83,12 @@ class _FileReader:
             on_command_line = argument.name in self._given and self._depth == 0
             file = Path(value).expanduser()
             value = str(file.absolute() if on_command_line else file)  # relative to the shell's folder
-        scope.context.variables[argument.name] = value
+        scope.variables[argument.name] = value
 
     def _let(self, body: YamlPlace, scope: Scope) -> None:
         fields = body.fields(("name", "value", *CONDITION), ("name", "value"))
         if scope.holds(fields):
-            scope.context.variables[fields["name"].text()] = scope.text(fields["value"])
+            scope.variables[fields["name"].text()] = scope.text(fields["value"])
 
     def _node(self, body: YamlPlace, scope: Scope) -> None:
         spec = read_node(body, scope)
@@ -113,7 +114,7 @@ class _FileReader:
                 raise fields["run_dir"].problem(
                     f"run_dir {name!r}: give a name of letters, digits and underscores, none of topics, nodes, dev, log"
                 )
-            inner.context.run_dir /= name
+            inner.run_dir /= name
             inner.group = f"{inner.group}/{name}".strip("/")
         self._entries(fields["launch"], inner)
 
@@ -127,13 +128,12 @@ class _FileReader:
             return
         if self._depth >= _MAX_INCLUDE_DEPTH:
             raise body.problem(f"files include each other more than {_MAX_INCLUDE_DEPTH} deep")
-        beside = scope.context.launch_file.parent / name
+        beside = scope.file.parent / name
         try:
             file = beside.resolve() if paths.is_file(beside) else find_launch_file(name)
         except FileNotFoundError:
             raise fields["file"].problem(f"launch file {name} does not exist") from None
-        inner = scope.child()
-        inner.context = LaunchContext(file, scope.context.run_dir)
+        inner = dataclasses.replace(scope.child(), file=file, variables={})
         reader = _FileReader(self._nodes, self._problems, given, self._depth + 1)
         reader.read(inner)
         if unknown := [name for name in given if name not in reader.arguments]:
@@ -167,7 +167,7 @@ def read_launch_file(
     given = dict(arguments or {})
     nodes: list[NodeSpec] = []
     problems: list[YamlProblem] = []
-    scope = Scope(LaunchContext(file.resolve(), run_dir or paths.run_dir()))
+    scope = Scope(file.resolve(), run_dir or paths.run_dir())
     reader = _FileReader(nodes, problems, given)
     try:
         reader.read(scope)

@@ -7,7 +7,6 @@ operand, whatever it looks like.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
 from pathlib import Path
 
 from simpleeval import SimpleEval
@@ -19,23 +18,13 @@ class SubstitutionError(ValueError):
     """A substitution cannot be evaluated; the message says which and why."""
 
 
-@dataclass
-class LaunchContext:
-    """Values that substitutions refer to.
-
-    Attributes:
-        launch_file: the file that contains the text.
-        run_dir: run directory of the stack, or of its group.
-        variables: values of the arguments and ``let`` entries in scope.
-    """
-
-    launch_file: Path
-    run_dir: Path
-    variables: dict[str, str] = field(default_factory=dict)
-
-
-def substitute(text: str, context: LaunchContext) -> str:
+def substitute(text: str, variables: Mapping[str, str], run_dir: Path) -> str:
     """Replace every ``$(...)`` of a text.
+
+    Args:
+        text: the text.
+        variables: values of the arguments and ``let`` entries in scope.
+        run_dir: run directory of the stack, or of its group.
 
     Raises:
         SubstitutionError: a substitution or variable is unknown, a file is missing, an expression is wrong, or a
@@ -45,7 +34,7 @@ def substitute(text: str, context: LaunchContext) -> str:
     position = 0
     while (start := text.find("$(", position)) >= 0:
         end = _closing_parenthesis(text, start + 2)
-        parts += [text[position:start], _replacement(text[start + 2 : end], context)]
+        parts += [text[position:start], _replacement(text[start + 2 : end], variables, run_dir)]
         position = end + 1
     parts.append(text[position:])
     return "".join(parts)
@@ -74,22 +63,22 @@ def _closing_parenthesis(text: str, position: int) -> int:
     raise SubstitutionError(f"unclosed $( in {text!r}")
 
 
-def _replacement(body: str, context: LaunchContext) -> str:
+def _replacement(body: str, variables: Mapping[str, str], run_dir: Path) -> str:
     name, _, argument = (part.strip() for part in body.strip().partition(" "))
     if name == "var":
-        if argument not in context.variables:
-            have = ", ".join(sorted(context.variables)) or "none"
+        if argument not in variables:
+            have = ", ".join(sorted(variables)) or "none"
             raise SubstitutionError(f"unknown variable {argument!r} (in scope: {have})")
-        return context.variables[argument]
+        return variables[argument]
     if name == "config":
         try:
             return str(paths.shipped_file("config", argument))
         except FileNotFoundError as error:
             raise SubstitutionError(str(error)) from None
     if name == "run-dir" and not argument:
-        return str(context.run_dir)
+        return str(run_dir)
     if name == "eval":
-        return _evaluated(argument, context.variables)
+        return _evaluated(argument, variables)
     raise SubstitutionError(
         f"unknown substitution $({name} ...); supported: $(var NAME), $(config FILE), $(run-dir), $(eval EXPRESSION)"
     )

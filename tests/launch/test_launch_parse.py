@@ -9,13 +9,9 @@ from hypothesis import strategies as st
 from instant_ic.config.params import parse_override
 from instant_ic.config.yaml_text import one_line
 from instant_ic.launch import LaunchFileError, read_arguments, read_launch_file
-from instant_ic.launch.substitutions import LaunchContext, SubstitutionError, substitute, truth
+from instant_ic.launch.substitutions import SubstitutionError, substitute, truth
 
-
-@pytest.fixture
-def context(tmp_path: Path) -> LaunchContext:
-    variables = {"world": "hall", "on": "true", "evil": "x == x or", "port": "80"}
-    return LaunchContext(tmp_path / "a.yaml", tmp_path / "run", variables)
+VARIABLES = {"world": "hall", "on": "true", "evil": "x == x or", "port": "80"}
 
 
 @pytest.fixture
@@ -51,8 +47,8 @@ def problems_of(file: Path, **arguments: str) -> list[str]:
         ("$(eval world)", "hall"),
     ],
 )
-def test_substitution(context: LaunchContext, text: str, expected: str) -> None:
-    assert substitute(text, context) == expected
+def test_substitution(text: str, expected: str) -> None:
+    assert substitute(text, VARIABLES, Path("run")) == expected
 
 
 @pytest.mark.parametrize(
@@ -75,16 +71,16 @@ def test_substitution(context: LaunchContext, text: str, expected: str) -> None:
         ("$(eval 'a' * 9999999999 == '')", "not"),
     ],
 )
-def test_substitution_error(context: LaunchContext, text: str, message: str) -> None:
+def test_substitution_error(text: str, message: str) -> None:
     with pytest.raises(SubstitutionError) as caught:
-        substitute(text, context)
+        substitute(text, VARIABLES, Path("run"))
     assert message in str(caught.value)
 
 
 @given(st.text(max_size=20), st.text(max_size=20))
 def test_eval_compares_any_two_values_as_text(left: str, right: str) -> None:
-    context = LaunchContext(Path("a.yaml"), Path("run"), {"left": left, "right": right})
-    assert truth(substitute("$(eval left == right)", context)) == (left == right)
+    result = substitute("$(eval left == right)", {"left": left, "right": right}, Path("run"))
+    assert truth(result) == (left == right)
 
 
 def test_every_key(tmp_path: Path, program: Path) -> None:
