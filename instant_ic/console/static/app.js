@@ -1,7 +1,7 @@
 // @ts-check
 // The operator's page: connects link, lease, drive, images and overlay.
 
-/** @import { Frame, GridFrame, Message } from "./messages.js" */
+/** @import { Frame, GridFrame, Message, State } from "./messages.js" */
 import { all, byId, elementOf, mark } from "./dom.js";
 import { attachStick, Drive, isDriveKey } from "./drive.js";
 import { Gamepads } from "./gamepad.js";
@@ -20,7 +20,16 @@ const helpDialog = elementOf("help", HTMLDialogElement);
 const link = new Link(`${location.protocol === "https:" ? "wss" : "ws"}://${location.host}/ws`);
 const lease = new Lease(link);
 const drive = new Drive(link);
-attachStop(); // first: it works without an image too
+/** @type {State | null} The newest state message. */
+let state = null;
+// First what works without an image too: emergency stop and banner.
+attachStop();
+for (const name of ["open", "lost"]) link.addEventListener(name, showBanner);
+lease.addEventListener("change", showBanner);
+link.addEventListener("signed-out", () => location.reload()); // shows the sign-in form
+onDetail(link, "message", (/** @type {Message} */ message) => {
+  if (message.type === "session") lease.take(message);
+});
 const viewer = makeViewer();
 const look = new Look(canvas);
 const images = new Images(viewer, link);
@@ -45,27 +54,18 @@ function onlyStop() {
   document.body.replaceChildren(text, byId("right-bottom"), byId("banner"), byId("toast"));
   text.hidden = false;
   lease.mayDrive = false;
-  const show = () => hud.showBanner(link, lease, null);
-  for (const name of ["open", "lost"]) link.addEventListener(name, show);
-  lease.addEventListener("change", show);
-  link.addEventListener("signed-out", () => location.reload());
-  onDetail(link, "message", (/** @type {Message} */ message) => {
-    if (message.type === "session") lease.take(message);
-  });
+}
+
+function showBanner() {
+  hud.showBanner(link, lease, state);
 }
 
 // ---- from the server -----------------------------------------------------------------------------
 
-link.addEventListener("open", showBanner);
-link.addEventListener("lost", () => {
-  drive.setEnabled(false); // the lease stays as it was on the page: the banner says what has happened
-  showBanner();
-});
-link.addEventListener("signed-out", () => location.reload()); // shows the sign-in form
+link.addEventListener("lost", () => drive.setEnabled(false)); // the page keeps the lease: the banner says what has happened
 lease.addEventListener("change", () => {
   drive.setEnabled(lease.drives);
   hud.showLease(lease);
-  showBanner();
 });
 onDetail(link, "message", (/** @type {Message} */ message) => {
   switch (message.type) {
@@ -78,6 +78,7 @@ onDetail(link, "message", (/** @type {Message} */ message) => {
       images.expectLayers();
       break;
     case "state":
+      state = message;
       screen.take(message);
       hud.showMode(message, lease.driver);
       showBanner();
@@ -90,9 +91,6 @@ onDetail(link, "message", (/** @type {Message} */ message) => {
       break;
     case "health":
       hud.showHealth(message);
-      break;
-    case "session":
-      lease.take(message);
       break;
     case "refused":
       if (message.reason === "not_driver") hud.toast(lease.refusal);
@@ -119,10 +117,6 @@ async function takeGrid(grid) {
     wake();
     link.acknowledge(grid);
   }
-}
-
-function showBanner() {
-  hud.showBanner(link, lease, screen.state);
 }
 
 // ---- from the operator -----------------------------------------------------------------------------

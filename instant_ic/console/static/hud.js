@@ -32,8 +32,8 @@ export function showLatency(link, images) {
     write(element, shown === null ? "–" : text(shown));
     element.className = shown === null ? "" : shown > bad ? "bad" : shown > warn ? "warn" : "";
   };
-  const ms = texts.millisecondsText;
-  put("link-ms", link.roundTripMs, (value) => ms(value) + (link.quality ? ` · ${link.quality}` : ""), 80, 200);
+  const ms = texts.millisecondsText, { clock } = link;
+  put("link-ms", clock.roundTripMs, (value) => ms(value) + (clock.quality ? ` · ${clock.quality}` : ""), 80, 200);
   put("image-ms", images.ageMs(), ms, 400, 1000);
   put("camera-ms", images.blend < 1 ? images.cameraMs : null, ms, 400, 1000);
   const rate = link.commandHz ? ` · ${Math.round(link.commandHz)} /s` : "";
@@ -56,7 +56,8 @@ export function showHealth({ vspace, battery, faults, nodes, pace }) {
   }
   const total = nodes.reduce((sum, node) => sum + node.cpu_percent, 0);
   write(byId("cpu"), nodes.length ? `${Math.round(total)} %` : "–");
-  replaceLines(byId("cpu-list"), nodes.map(texts.cpuText));
+  replaceItems(byId("cpu-list"), nodes, ({ name, cpu_percent }) =>
+    Object.assign(document.createElement("li"), { textContent: `${name}: ${Math.round(cpu_percent)} %` }));
   replaceItems(byId("faults"), faults, ({ level, name, text }) => {
     const item = document.createElement("li"), bold = document.createElement("b");
     item.className = level;
@@ -77,11 +78,6 @@ function replaceItems(element, entries, item) {
   if (element.dataset.key === key) return;
   element.dataset.key = key;
   element.replaceChildren(...entries.map(item));
-}
-
-/** Fills a list with lines of text. @param {HTMLElement} element @param {string[]} lines */
-export function replaceLines(element, lines) {
-  replaceItems(element, lines, (line) => Object.assign(document.createElement("li"), { textContent: line }));
 }
 
 /** @param {Drive} drive */

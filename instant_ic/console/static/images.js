@@ -31,6 +31,7 @@ import { Prediction } from "./prediction.js";
  */
 
 const STALE_MS = 2000;
+const KEPT_TIMES = 100; // of images, for their rate
 // Longest wait for an image made after the change of mode; afterwards the best available is shown.
 const WAIT_MS = { [PANORAMA]: 300, [VIEW]: 500 };
 const LAYERS_MS = 5000; // longest wait for the layers of a new link
@@ -57,7 +58,6 @@ export class Images {
     /** @type {Map<string, Surface>} Loaded surfaces, by id. */
     this._held = new Map();
     this._loads = 0; // counts loads, so that a late one of a lost link is dropped
-    this.framesPerSecond = 0; // of what this page renders
     /** @type {number | null} Time from the capture of a camera image to the end of its first rendering. */
     this.cameraMs = null;
     /** @type {PanoramaHeader | null} The camera image of the frame that is being rendered. */
@@ -75,15 +75,13 @@ export class Images {
     this._followed = null;
     this._lead = 0; // share of the time that a command takes to the robot which is predicted
     this._virtual = false;
-    // Time since which images of each kind are made at the shown robot; server's clock.
-    this._since = { [PANORAMA]: 0, [VIEW]: 0 };
-    this._nearVbot = false;
-    this._nearRobot = true;
+    // Time since which images of each kind are made at the shown robot, server's clock; Infinity: they are not.
+    this._since = { [PANORAMA]: Infinity, [VIEW]: Infinity };
     this._changedAt = 0;
     this._toward = 0;
     this._gains = { [PANORAMA]: new Releasing(), [VIEW]: new Releasing() };
     /** @type {Record<Kind, number[]>} */
-    this._arrivals = { [PANORAMA]: [], [VIEW]: [] };
+    this._times = { [PANORAMA]: [], [VIEW]: [] };
     this.configure(DEFAULT_PAGE);
   }
 
@@ -108,9 +106,7 @@ export class Images {
       }
       bitmap.close();
       this.changed = true;
-      const arrivals = this._arrivals[frame.kind];
-      arrivals.push(performance.now());
-      if (arrivals.length > 30) arrivals.shift();
+      this.countFrame(frame.kind);
     } catch (error) {
       console.warn(`image ${frame.sequence} of kind ${frame.kind}: ${error}`);
     } finally {
@@ -159,13 +155,15 @@ export class Images {
     return this.layers !== null && !this.viewer.lost;
   }
 
+  /** Counts an image that came, or a view that this page has rendered by itself. @param {Kind} kind */
+  countFrame(kind) {
+    this._times[kind] = [...this._times[kind].slice(1 - KEPT_TIMES), performance.now()];
+  }
+
   /** Images of a kind per second, over the last 3 s. @param {Kind} kind */
   rate(kind) {
-    if (kind === VIEW && this.rendersLayers) return this.framesPerSecond;
-    const now = performance.now();
-    const recent = this._arrivals[kind].filter((t) => now - t < 3000);
-    if (recent.length < 2) return 0;
-    return (1000 * (recent.length - 1)) / (now - recent[0]);
+    const now = performance.now(), recent = this._times[kind].filter((t) => now - t < 3000);
+    return recent.length < 2 ? 0 : (1000 * (recent.length - 1)) / (now - recent[0]);
   }
 
   /** Notes that a frame with the newest images is being rendered. */
@@ -278,17 +276,14 @@ export class Images {
    * @param {State | null} state @param {number} elapsedMs
    */
   _step(state, elapsedMs) {
-    const virtual = shows(state) === "virtual";
-    const at = state?.at_ms ?? 0;
+    const virtual = shows(state) === "virtual", at = state?.at_ms ?? 0;
     if (virtual !== this._virtual) this._changedAt = at;
     this._virtual = virtual;
     // In ENTERING, views are already rendered at the v-bot's pose. In RETURNING, the camera is already there, and the
     // switch comes when its newest image shows the same place as the view.
     const nearVbot = virtual || state?.mode === "entering", nearRobot = !virtual || state?.mode === "returning";
-    if (nearVbot && !this._nearVbot) this._since[VIEW] = at;
-    if (nearRobot && !this._nearRobot) this._since[PANORAMA] = at;
-    this._nearVbot = nearVbot;
-    this._nearRobot = nearRobot;
+    this._since[VIEW] = nearVbot ? Math.min(this._since[VIEW], at) : Infinity;
+    this._since[PANORAMA] = nearRobot ? Math.min(this._since[PANORAMA], at) : Infinity;
     // A stop shows the real view, however old; so does a lost controller.
     const waits = virtual || state?.mode === "real";
     const kind = virtual ? VIEW : PANORAMA, wanted = virtual ? 1 : 0;
@@ -326,7 +321,7 @@ export class Images {
     const now = this.link.serverNow() ?? state?.at_ms ?? 0, age = state ? now - state.at_ms : 0;
     const twist = state?.twist ?? [0, 0];
     if (state && pose && state.mode === "virtual" && robot === "virtual" && this.rendersLayers) {
-      const delay = (this._lead * (this.link.roundTripMs ?? 0)) / 2;
+      const delay = (this._lead * (this.link.clock.roundTripMs ?? 0)) / 2;
       const present = this.prediction.from(pose, twist, state.at_ms, now, delay);
       this.motion.follow(robot, present.pose, present.twist, 0, elapsedMs);
       this.moves = present.twist[0] !== 0 || present.twist[1] !== 0;

@@ -42,15 +42,6 @@ export class Link extends EventTarget {
     return this.clock.at(performance.now());
   }
 
-  get roundTripMs() {
-    return this.clock.roundTripMs;
-  }
-
-  /** Quality of the link: "good", "fair", "poor"; null if unknown. */
-  get quality() {
-    return this.connected ? this.clock.quality : null;
-  }
-
   /** @param {{type: string, [field: string]: unknown}} message */
   send(message) {
     if (this._socket?.readyState === WebSocket.OPEN) this._socket.send(JSON.stringify(message));

@@ -11,9 +11,10 @@ export function saveView(canvas, render) {
   const { width, height } = canvas;
   canvas.width = Math.round(canvas.clientWidth * devicePixelRatio);
   canvas.height = Math.round(canvas.clientHeight * devicePixelRatio);
+  const stamp = new Date().toLocaleString("sv").replaceAll(/[-:]/g, "").replace(" ", "_"); // Swedish time is ISO 8601
   render(); // WebGL discards the image after the task that rendered it
   canvas.toBlob((blob) => {
-    if (blob) download(blob, `view_${stamp()}.png`);
+    if (blob) download(blob, `view_${stamp}.png`);
     else toast("Not saved: the browser could not encode the image.");
   }, "image/png");
   canvas.width = width;
@@ -29,11 +30,4 @@ function download(blob, name) {
   link.click();
   setTimeout(() => URL.revokeObjectURL(link.href), 10_000);
   toast(`Saved: ${name}`);
-}
-
-function stamp() {
-  /** @param {number} value */
-  const two = (value) => String(value).padStart(2, "0");
-  const now = new Date(), day = `${now.getFullYear()}${two(now.getMonth() + 1)}${two(now.getDate())}`;
-  return `${day}_${two(now.getHours())}${two(now.getMinutes())}${two(now.getSeconds())}`;
 }

@@ -10,12 +10,11 @@
 /** @import { Vec3 } from "./math.js" */
 /** @import { GlViewer } from "./viewer.js" */
 import { byId, elementOf, mark } from "./dom.js";
-import { FrameRate } from "./framerate.js";
 import { showCompass, showGuide } from "./guide.js";
 import { showLatency } from "./hud.js";
 import { shows } from "./images.js";
 import { radians, transpose } from "./math.js";
-import { DEFAULT_PAGE } from "./messages.js";
+import { DEFAULT_PAGE, VIEW } from "./messages.js";
 import { MiniMap } from "./minimap.js";
 import { saveView } from "./save.js";
 
@@ -44,7 +43,6 @@ export class Screen {
     this.plan = { trajectory: [], path: [], subgoal: null };
     /** @type {PageSettings} */
     this.settings = DEFAULT_PAGE;
-    this._rate = new FrameRate();
     this._frameAt = this._viewAt = this._steppedAt = performance.now();
     this._requested = this._wanted = false;
     this._timer = 0;
@@ -127,14 +125,11 @@ export class Screen {
     const scene = this.images.scene(this.state, this.look, tanHalf, elapsed);
     const moved = this._renderView(scene);
     this._reportShown();
-    this._rate.frame(now, moved);
     this._showOverlay(scene, tanHalf);
     this._drawMap(tanHalf, now);
     if (now - this._latencyAt > LATENCY_MS) {
       this._latencyAt = now;
       showLatency(this.link, this.images);
-      this.images.framesPerSecond = this._rate.perSecond;
-      mark("fps", this._rate.perSecond.toFixed(1));
       mark("image", this.images.shown ? (this.images.stale ? "stale" : "live") : "none");
     }
     // For tests and debugging.
@@ -198,6 +193,7 @@ export class Screen {
     this._viewAt = this._frameAt; // only such a frame costs a pause: in the first after a key nothing has moved yet
     images.startFrame();
     viewer.render(scene);
+    if (scene.camera && scene.blend > 0) images.countFrame(VIEW);
     // For measurements: the rendered image and its position.
     const { motion, view, panorama, place } = images;
     const detail = { shown: shows(this.state), pose: motion.pose, blend: scene.blend, view, panorama, place };

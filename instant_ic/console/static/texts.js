@@ -1,10 +1,9 @@
 // @ts-check
 // Texts of the overlay, chosen by codes: modes, node names and states. No logic depends on a text of the robot.
 
-/** @import { Health, RecordingStatus, Session, State, Vspace } from "./messages.js" */
+/** @import { RecordingStatus, Session, State, Vspace } from "./messages.js" */
 
 /** @typedef {State["mode"]} Mode */
-/** @typedef {Health["nodes"][number]} NodeCpu */
 
 /** @type {Record<Mode, [string, string]>} Name of a mode, and its usual reason. */
 const MODES = {
@@ -33,9 +32,6 @@ const NODES = {
 
 /** @param {string} node */
 export const nodeText = (node) => (Object.hasOwn(NODES, node) ? NODES[node] : node);
-
-/** CPU of a node, percent of one core. @param {NodeCpu} node */
-export const cpuText = (node) => `${node.name}: ${Math.round(node.cpu_percent)} %`;
 
 /** @param {string | null | undefined} text */
 const sentence = (text) => (text ? text[0].toUpperCase() + text.slice(1) : "");
@@ -74,7 +70,7 @@ export function vspaceQuality(vspace) {
   const { psnr_db, expected_psnr_db, unseen_share, radius_m } = vspace, parts = [];
   if (expected_psnr_db > 0) parts.push(`${expected_psnr_db.toFixed(0)} dB here`, `${Math.round(100 * (1 - unseen_share))} % seen`);
   else if (psnr_db > 0) parts.push(`${psnr_db.toFixed(1)} dB`);
-  if (radius_m > 0) parts.push(`within ${radius_m.toFixed(1)} m`);
+  if (radius_m > 0) parts.push(`within ${radius_m.toFixed(1)}\u00a0m`);
   return parts.map((part) => ` · ${part}`).join("");
 }
 

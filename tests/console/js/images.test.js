@@ -16,7 +16,7 @@ function close(found, expected, tolerance) {
 /** Scenes every 10 ms; `at` gives the camera's image, if a new one comes, and the state of a time in ms. */
 function scenes(slow, duration, at) {
   let now = 0;
-  const images = new Images({ slow, sample() {} }, { serverNow: () => now, roundTripMs: 10, acknowledge() {} });
+  const images = new Images({ slow, sample() {} }, { serverNow: () => now, clock: { roundTripMs: 10 }, acknowledge() {} });
   images.layers = { version: 1, mount: [0.1, 0, 1.2] };
   images.configure({ ...DEFAULT_PAGE, colour_release_s: 0 });
   const found = [];

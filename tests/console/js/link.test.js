@@ -40,7 +40,7 @@ test("a link is open after the first answer, not with the socket", () => {
   answerPing();
   assert.deepEqual(events, ["open"]);
   assert.equal(link.serverNow(), 5010); // half of 20 ms later
-  assert.deepEqual([link.roundTripMs, link.commandAgeMs, link.commandHz], [20, 7, 20]);
+  assert.deepEqual([link.clock.roundTripMs, link.commandAgeMs, link.commandHz], [20, 7, 20]);
 });
 
 test("commands carry the server's time and increasing numbers", () => {
