@@ -89,7 +89,7 @@ def test_the_view_is_saved(driver, shared_demo):
 def test_link_rates_and_readiness_are_told(driver, shared_demo):
     wait_until(lambda: re.fullmatch(r"\d+ ms · (good|fair|poor)", text_of(driver, "#link-ms")), driver, "the link")
     wait_until(lambda: re.fullmatch(r"\d+ ms", text_of(driver, "#camera-ms")), driver, "the camera's latency")
-    assert text_of(driver, "#vspace") == "Virtual space ready · 26 dB here · 97 % seen · within 2.0 m"
+    assert text_of(driver, "#vspace") == "Virtual space ready · 26 dB here · 97 % seen · within 2.0\N{NO-BREAK SPACE}m"
     assert text_of(driver, "#battery") == "24.6 V · 81 %"
     wait_until(lambda: re.fullmatch(r"\d+ · \d+ /s", text_of(driver, "#rates")), driver, "rates of pictures")
     start_driving(driver, shared_demo)

@@ -109,7 +109,7 @@ onDetail(link, "frame", (/** @type {Frame} */ received) => {
 async function takeGrid(grid) {
   try {
     const bitmap = await createImageBitmap(grid.payload, { colorSpaceConversion: "none" });
-    screen.minimap.setLayer(grid.kind === MAP ? "map" : "costmap", bitmap, grid.header);
+    screen.minimap.setGrid(grid.kind === MAP ? "map-grid" : "cost-grid", bitmap, grid.header);
     bitmap.close();
   } catch (error) {
     console.warn(`map ${grid.sequence}: ${error}`);

@@ -30,6 +30,12 @@ export function write(element, text) {
   if (element.textContent !== text) element.textContent = text;
 }
 
+/** Sets an attribute if it has changed: else the browser would render again. @param {string} id @param {string} name @param {string} value */
+export function attribute(id, name, value) {
+  const element = byId(id);
+  if (element.getAttribute(name) !== value) element.setAttribute(name, value);
+}
+
 /** Sets a data attribute of the page, for styles and tests, if it has changed. @param {string} name @param {string} value */
 export function mark(name, value) {
   if (document.body.dataset[name] !== value) document.body.dataset[name] = value;

@@ -2,7 +2,7 @@
 // The predicted trajectory as a ribbon on the floor, and the compass tape.
 
 /** @import { Mat3, Vec3 } from "./math.js" */
-import { byId } from "./dom.js";
+import { attribute, byId } from "./dom.js";
 import { degrees, rotate, wrapAngle } from "./math.js";
 
 const NEAREST_M = 0.25;
@@ -42,21 +42,15 @@ export function extended(points) {
  */
 export function showGuide(trajectory, camera, tanHalf, halfWidth) {
   const { left, right } = projected(trajectory, camera, tanHalf, halfWidth), ends = [...left.slice(-1), ...right.slice(-1)];
-  set("guide-rails", "d", left.length < 2 ? "" : `M${left.join(" ")}M${right.join(" ")}`);
-  set("guide-floor", "points", [...left, ...right.toReversed()].join(" "));
-  set("guide-fade", "y1", String(innerHeight));
-  set("guide-fade", "y2", String(Math.min(innerHeight, ...ends.map(([, y]) => y))));
+  attribute("guide-rails", "d", left.length < 2 ? "" : `M${left.join(" ")}M${right.join(" ")}`);
+  attribute("guide-floor", "points", [...left, ...right.toReversed()].join(" "));
+  attribute("guide-fade", "y1", String(innerHeight));
+  attribute("guide-fade", "y2", String(Math.min(innerHeight, ...ends.map(([, y]) => y))));
 }
 
 /** Turns the tape of directions, of which 0 is straight ahead of the robot. @param {number} lookYaw */
 export function showCompass(lookYaw) {
   byId("compass-tape").style.translate = `${(degrees(lookYaw) * COMPASS_PIXELS).toFixed(1)}px`;
-}
-
-/** Sets an attribute if it has changed: else the browser would render again. @param {string} id @param {string} name @param {string} value */
-function set(id, name, value) {
-  const element = byId(id);
-  if (element.getAttribute(name) !== value) element.setAttribute(name, value);
 }
 
 /**

@@ -1,11 +1,11 @@
 // @ts-check
-// Map in the corner: walls, costs, both robots, path, subgoal and predicted trajectory.
+// Map in the corner: walls, costs, both robots, path, subgoal and predicted trajectory. SVG in metres over two grids.
 
 /** @import { GridHeader, Plan } from "./messages.js" */
 /** @import { Vec3 } from "./math.js" */
-import { byId, context2d } from "./dom.js";
+import { attribute, byId, context2d, elementOf } from "./dom.js";
+import { degrees } from "./math.js";
 
-/** @typedef {{image: HTMLCanvasElement, header: GridHeader}} Layer */
 /**
  * @typedef {object} MapScene
  * @property {boolean} virtual whether the v-bot is shown
@@ -16,160 +16,89 @@ import { byId, context2d } from "./dom.js";
  * @property {number} lookYaw
  * @property {number} hfov
  */
+/** @typedef {"cost-grid" | "map-grid"} GridName Ids of their canvases. */
 
-const COLOURS = { real: "#45c4b0", virtual: "#f0ac45", path: "#8fb8ff", goal: "#ffffff" };
 const RADIUS_M = 3.5; // half the width shown in the small map
-const CONE_M = 1.7; // length of the shown cone of sight
+const CONE_M = 1.7; // length of the cone of sight
 
 export class MiniMap {
-  /** @param {HTMLCanvasElement} canvas */
-  constructor(canvas) {
-    this.canvas = canvas;
-    this.context = context2d(canvas);
+  constructor() {
     this.large = false;
-    this.changed = true; // render although no pose has changed
-    /** @type {{costmap: Layer | null, map: Layer | null}} In the order of rendering. */
-    this._layers = { costmap: null, map: null };
+    /** @type {Map<GridName, GridHeader>} */
+    this._grids = new Map();
   }
 
-  /** Sets a layer of grey cells (gridimage.py). @param {"map" | "costmap"} name @param {ImageBitmap} bitmap @param {GridHeader} header */
-  setLayer(name, bitmap, header) {
-    this.changed = true;
-    this._layers[name] = { image: coloured(bitmap, name === "map" ? mapColour : costColour), header };
+  /** Sets a grid of grey cells (gridimage.py). @param {GridName} name @param {ImageBitmap} bitmap @param {GridHeader} header */
+  setGrid(name, bitmap, header) {
+    this._grids.set(name, header);
+    colour(elementOf(name, HTMLCanvasElement), bitmap, name === "map-grid" ? mapColour : costColour);
   }
 
   get hasMap() {
-    return this._layers.map !== null;
+    return this._grids.has("map-grid");
   }
 
   /** @param {MapScene} scene */
-  draw({ virtual, robot, vbot, plan, footprint, lookYaw, hfov }) {
-    this.changed = false;
-    const { context, canvas } = this, shown = virtual ? vbot ?? robot : robot ?? vbot;
-    context.reset();
+  show({ virtual, robot, vbot, plan, footprint, lookYaw, hfov }) {
+    const shown = virtual ? vbot ?? robot : robot ?? vbot;
     byId("map-empty").hidden = shown !== null;
     if (!shown) return;
-    const scale = this._place(shown, canvas.width, canvas.height), pixel = 1 / scale;
-    for (const layer of Object.values(this._layers)) if (layer) this._drawLayer(layer);
-    this._cone(shown, shown[2] + lookYaw, hfov / 2);
-    this._line(plan.path, COLOURS.path, 2 * pixel, [6 * pixel, 5 * pixel]);
-    this._line(plan.trajectory, virtual ? COLOURS.virtual : COLOURS.real, 3 * pixel, []);
-    if (plan.subgoal) this._goal(plan.subgoal, pixel);
-    if (robot) this._robot(robot, footprint, COLOURS.real, pixel, true);
-    if (vbot && virtual) this._robot(vbot, footprint, COLOURS.virtual, pixel, false);
+    const world = this._pixelsFromMap(shown);
+    for (const [name, { x, y, height, resolution }] of this._grids) {
+      const top = y + height * resolution;
+      byId(name).style.transform = `${world} translate(${x}px, ${top}px) scale(${resolution}, ${-resolution})`;
+    }
+    attribute("map-world", "transform", world);
+    attribute("map-path", "points", plan.path.join(" "));
+    attribute("map-trajectory", "points", plan.trajectory.join(" "));
+    const side = CONE_M * Math.sin(hfov / 2), ahead = CONE_M * Math.cos(hfov / 2);
+    attribute("map-cone", "d", `M0 0L${ahead} ${-side}A${CONE_M} ${CONE_M} 0 0 1 ${ahead} ${side}`);
+    place("map-cone", [shown[0], shown[1], shown[2] + lookYaw]);
+    place("map-robot", robot, footprint);
+    place("map-vbot", virtual ? vbot : null, footprint);
+    place("map-goal", plan.subgoal);
   }
 
   /**
-   * Scales the canvas to metres and returns pixels per metre. Small: heading up; large: north up with the whole map.
-   * @param {Vec3} shown @param {number} width @param {number} height
+   * Returns the transform from the map frame to pixels of the element. Small: heading up; large: north up, the whole map.
+   * @param {Vec3} shown
    */
-  _place([x, y, yaw], width, height) {
-    const context = this.context;
-    if (this.large && this._layers.map) {
-      const { header } = this._layers.map;
-      const w = header.width * header.resolution, h = header.height * header.resolution;
-      const scale = Math.min(width / (w + 1), height / (h + 1));
-      context.translate(width / 2, height / 2);
-      context.scale(scale, -scale);
-      context.translate(-(header.x + w / 2), -(header.y + h / 2));
-      return scale;
+  _pixelsFromMap([x, y, yaw]) {
+    const { clientWidth: width, clientHeight: height } = byId("map"), grid = this._grids.get("map-grid");
+    if (this.large && grid) {
+      const w = grid.width * grid.resolution, h = grid.height * grid.resolution, scale = Math.min(width / (w + 1), height / (h + 1));
+      return matrix(scale, 0, [grid.x + w / 2, grid.y + h / 2], [width / 2, height / 2]);
     }
-    const scale = Math.min(width, height) / (2 * RADIUS_M);
-    context.translate(width / 2, height * 0.6);
-    context.scale(scale, -scale);
-    context.rotate(Math.PI / 2 - yaw);
-    context.translate(-x, -y);
-    return scale;
-  }
-
-  /** @param {Layer} layer */
-  _drawLayer({ image, header }) {
-    const context = this.context;
-    const h = header.height * header.resolution;
-    context.save();
-    context.imageSmoothingEnabled = false;
-    context.translate(header.x, header.y + h);
-    context.scale(header.resolution, -header.resolution);
-    context.drawImage(image, 0, 0);
-    context.restore();
-  }
-
-  /** @param {[number, number][]} points @param {string} colour @param {number} width m @param {number[]} dash */
-  _line(points, colour, width, dash) {
-    const context = this.context;
-    context.strokeStyle = colour;
-    context.lineWidth = width;
-    context.lineJoin = context.lineCap = "round";
-    context.setLineDash(dash);
-    context.beginPath();
-    for (const [x, y] of points) context.lineTo(x, y);
-    context.stroke();
-  }
-
-  /** @param {Vec3} goal @param {number} pixel m */
-  _goal([x, y], pixel) {
-    const context = this.context;
-    context.strokeStyle = COLOURS.goal;
-    context.lineWidth = 2 * pixel;
-    for (const radius of [6, 1.5]) {
-      context.beginPath();
-      context.arc(x, y, radius * pixel, 0, 2 * Math.PI);
-      context.stroke();
-    }
-  }
-
-  /** The shown part of the surroundings. @param {Vec3} pose @param {number} middle direction @param {number} half angle */
-  _cone([x, y], middle, half) {
-    const context = this.context, gradient = context.createRadialGradient(x, y, 0, x, y, CONE_M);
-    gradient.addColorStop(0, "rgba(255,255,255,0.28)");
-    gradient.addColorStop(1, "rgba(255,255,255,0)");
-    context.fillStyle = gradient;
-    context.beginPath();
-    context.moveTo(x, y);
-    context.arc(x, y, CONE_M, middle - half, middle + half);
-    context.fill();
-  }
-
-  /** @param {Vec3} pose @param {[number, number]} footprint @param {string} colour @param {number} pixel @param {boolean} solid */
-  _robot([x, y, yaw], [length, width], colour, pixel, solid) {
-    const context = this.context;
-    context.save();
-    context.translate(x, y);
-    context.rotate(yaw);
-    context.lineWidth = 2 * pixel;
-    context.strokeStyle = colour;
-    context.fillStyle = solid ? colour : "rgba(240,172,69,0.22)";
-    if (!solid) context.setLineDash([4 * pixel, 3 * pixel]);
-    context.beginPath();
-    context.roundRect(-length / 2, -width / 2, length, width, 0.08);
-    context.fill();
-    context.stroke();
-    context.setLineDash([]);
-    // The triangle shows the heading.
-    context.fillStyle = solid ? "#0b0e12" : colour;
-    context.beginPath();
-    context.moveTo(length * 0.36, 0);
-    context.lineTo(-length * 0.05, width * 0.27);
-    context.lineTo(-length * 0.05, -width * 0.27);
-    context.fill();
-    context.restore();
+    return matrix(Math.min(width, height) / (2 * RADIUS_M), Math.PI / 2 - yaw, [x, y], [width / 2, height * 0.6]);
   }
 }
 
-/** @param {ImageBitmap} bitmap @param {(cell: number) => number[]} colour of a cell */
-function coloured(bitmap, colour) {
-  const image = document.createElement("canvas");
-  image.width = bitmap.width;
-  image.height = bitmap.height;
-  const context = context2d(image, { willReadFrequently: true });
+/**
+ * Returns the transform that turns by `angle`, scales, and shows the place of the map at a pixel; y points up in the map.
+ * @param {number} scale @param {number} angle @param {[number, number]} place @param {[number, number]} pixel
+ */
+function matrix(scale, angle, [x, y], [column, row]) {
+  const c = scale * Math.cos(angle), s = scale * Math.sin(angle);
+  return `matrix(${c}, ${-s}, ${-s}, ${-c}, ${column - c * x + s * y}, ${row + s * x + c * y})`;
+}
+
+/** Moves a mark of the map; hides it without a pose. @param {string} id @param {Vec3 | null} pose @param {[number, number]} size m */
+function place(id, pose, size = [1, 1]) {
+  byId(id).toggleAttribute("hidden", pose === null);
+  if (pose) attribute(id, "transform", `translate(${pose[0]} ${pose[1]}) rotate(${degrees(pose[2])}) scale(${size})`);
+}
+
+/** @param {HTMLCanvasElement} canvas @param {ImageBitmap} bitmap @param {(cell: number) => number[]} colourOf [r, g, b, alpha] of a cell */
+function colour(canvas, bitmap, colourOf) {
+  const { width, height } = Object.assign(canvas, { width: bitmap.width, height: bitmap.height });
+  const context = context2d(canvas, { willReadFrequently: true });
   context.drawImage(bitmap, 0, 0);
-  const cells = context.getImageData(0, 0, image.width, image.height);
-  for (let i = 0; i < cells.data.length; i += 4) cells.data.set(colour(cells.data[i]), i);
+  const cells = context.getImageData(0, 0, width, height);
+  for (let i = 0; i < cells.data.length; i += 4) cells.data.set(colourOf(cells.data[i]), i);
   context.putImageData(cells, 0, 0);
-  return image;
 }
 
-// Colours [r, g, b, alpha] of a cell: 0..100, 255 unknown.
+// A cell is 0..100, or 255: unknown.
 /** Floor and walls. @param {number} cell */
 const mapColour = (cell) => (cell < 50 ? [150, 165, 180, 70 - cell] : cell <= 100 ? [226, 232, 238, 120 + 1.3 * cell] : [0, 0, 0, 0]);
 /** @param {number} cell */

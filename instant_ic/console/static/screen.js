@@ -1,5 +1,5 @@
 // @ts-check
-// Renders main image, trajectory, compass and map, each only if it has changed. Frames follow each other while something
+// Renders the main image if it has changed, and shows trajectory, compass and map. Frames follow each other while something
 // moves; otherwise a message, an image or an input requests the next one.
 
 /** @import { PageSettings, Plan, State } from "./messages.js" */
@@ -9,7 +9,7 @@
 /** @import { Look } from "./look.js" */
 /** @import { Vec3 } from "./math.js" */
 /** @import { GlViewer } from "./viewer.js" */
-import { byId, elementOf, mark } from "./dom.js";
+import { byId, mark } from "./dom.js";
 import { showCompass, showGuide } from "./guide.js";
 import { showLatency } from "./hud.js";
 import { shows } from "./images.js";
@@ -23,7 +23,6 @@ const MAX_FOV = radians(149);
 const LATENCY_MS = 250;
 const SLOW_FRAME_MS = 45; // shortest frame time when the CPU renders, with fewer pixels
 const SLOW_PIXELS = 0.45; // share of the window's pixels per axis
-const SLOW_MAP_MS = 200;
 const STILL_PIXELS = 0.5, LEAST_PIXELS = 0.3; // smallest shown turn while the robot stands, and while the v-bot is driven
 const REPORT_MS = 500; // longest interval between two reports of the shown state while the camera is shown
 const IDLE_MS = 200; // longest interval between two frames while messages arrive
@@ -36,7 +35,7 @@ export class Screen {
     this.look = look;
     this.link = link;
     this.lease = lease;
-    this.minimap = new MiniMap(elementOf("map-canvas", HTMLCanvasElement));
+    this.minimap = new MiniMap();
     /** @type {State | null} The newest state message. */
     this.state = null;
     /** @type {Pick<Plan, "trajectory" | "path" | "subgoal">} The newest plan message. */
@@ -46,10 +45,10 @@ export class Screen {
     this._frameAt = this._viewAt = this._steppedAt = performance.now();
     this._requested = this._wanted = false;
     this._timer = 0;
-    this._latencyAt = this._mapAt = this._lookAt = 0;
+    this._latencyAt = this._lookAt = 0;
     /** Rotation and field of view of the last rendered image. @type {number[]} */
     this._direction = [];
-    this._sentLook = this._viewKey = this._mapKey = this._reported = "";
+    this._sentLook = this._viewKey = this._reported = "";
     this._reportedAt = 0;
     link.addEventListener("open", () => {
       this._sentLook = "";
@@ -126,7 +125,6 @@ export class Screen {
     const moved = this._renderView(scene);
     this._reportShown();
     this._showOverlay(scene, tanHalf);
-    this._drawMap(tanHalf, now);
     if (now - this._latencyAt > LATENCY_MS) {
       this._latencyAt = now;
       showLatency(this.link, this.images);
@@ -141,7 +139,6 @@ export class Screen {
   enlargeMap() {
     const large = this.minimap.large = byId("map").classList.toggle("large");
     byId("map-size").setAttribute("aria-label", large ? "Shrink the map" : "Enlarge the map");
-    this.minimap.changed = true;
     this.wake();
   }
 
@@ -206,25 +203,13 @@ export class Screen {
     const position = this._cameraPosition(), camera = { lookFromMap: transpose(scene.mapFromLook), position: position ?? [0, 0, 0] };
     showGuide(position && this.link.connected ? this.plan.trajectory : [], camera, tanHalf, this.settings.footprint[1] / 2);
     showCompass(this.look.yaw);
-  }
-
-  /** @param {[number, number]} tanHalf @param {number} now */
-  _drawMap(tanHalf, now) {
-    const { minimap, state, plan, look } = this;
-    const resized = fit(minimap.canvas);
-    if (this.viewer.slow && !resized && !minimap.changed && now - this._mapAt < SLOW_MAP_MS) return;
-    const poses = [rounded(state?.robot, 2), rounded(state?.vbot, 2)];
-    const key = [state?.mode, ...poses, JSON.stringify(plan), rounded([look.yaw, look.vfov], 2)].join(";");
-    if (!resized && !minimap.changed && key === this._mapKey) return;
-    this._mapKey = key;
-    this._mapAt = now;
-    minimap.draw({
-      virtual: shows(state) === "virtual",
-      robot: state?.robot ?? null,
-      vbot: state?.vbot ?? null,
-      plan,
+    this.minimap.show({
+      virtual: shows(this.state) === "virtual",
+      robot: this.state?.robot ?? null,
+      vbot: this.state?.vbot ?? null,
+      plan: this.plan,
       footprint: this.settings.footprint,
-      lookYaw: look.yaw,
+      lookYaw: this.look.yaw,
       hfov: 2 * Math.atan(tanHalf[0]),
     });
   }
@@ -242,8 +227,8 @@ export class Screen {
 /** @param {readonly number[] | null | undefined} values @param {number} digits */
 const rounded = (values, digits) => (values ? values.map((value) => value.toFixed(digits)).join() : "");
 
-/** Gives a canvas the size of its element; returns whether it changed. @param {HTMLCanvasElement} canvas */
-function fit(canvas, pixels = 1) {
+/** Gives a canvas the size of its element; returns whether it changed. @param {HTMLCanvasElement} canvas @param {number} pixels share per axis */
+function fit(canvas, pixels) {
   const ratio = Math.min(devicePixelRatio, 2) * pixels;
   const width = Math.round(canvas.clientWidth * ratio), height = Math.round(canvas.clientHeight * ratio);
   if (canvas.width === width && canvas.height === height) return false;

@@ -27,7 +27,7 @@ const NODES = {
   theta_camera: "Camera", vlp16_driver: "LiDAR", crawler_base: "Base", grid_slam: "Map and pose", arbiter: "Control",
   virtual_robot: "Virtual robot", navigator: "Path planner", depth_estimator: "Depth", depth_scaler: "Depth",
   nerf: "Virtual space", console: "Console", operator_recorder: "Recorder", host_bridge: "Link to the robot",
-  network: "Network",
+  network: "Network", simulator: "Simulator",
 };
 
 /** @param {string} node */
