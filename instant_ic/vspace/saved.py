@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 import zipfile
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, get_type_hints
+from typing import Any, get_args, get_origin, get_type_hints
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,9 +17,10 @@ from instant_ic.vspace.config import VirtualSpaceConfig
 from instant_ic.vspace.nerf.field import FieldParameters, Floats, Lattice
 from instant_ic.vspace.prior import PanoramaPrior
 
-FORMAT, VERSION = "instant_ic virtual space", 5
+FORMAT = "instant_ic virtual space, version 6"
 FILE_NAME = "space.npz"
 """Name of the file in a folder."""
+Arrays = dict[str, NDArray[Any]]
 
 
 class SpaceFileError(ValueError):
@@ -77,19 +77,8 @@ def write(path: str | Path, saved: SavedSpace) -> Path:
     Raises:
         OSError: it cannot be written.
     """
-    file = space_file(path)
-    head = {
-        "format": FORMAT,
-        "version": VERSION,
-        "config": dataclasses.asdict(saved.config),
-        "keyframes": len(saved.priors),
-        "progress": dataclasses.asdict(saved.progress),
-    }
-    arrays: dict[str, NDArray[Any]] = {"head": np.frombuffer(json.dumps(head).encode(), np.uint8), "gains": saved.gains}
-    groups: dict[str, Any] = {f"prior.{number}": prior for number, prior in enumerate(saved.priors)}
-    for group, part in (groups | {"lattice": saved.lattice, "parameters": saved.parameters}).items():
-        for field in dataclasses.fields(part):
-            arrays[f"{group}.{field.name}"] = np.asarray(getattr(part, field.name))
+    file, arrays = space_file(path), {"format": np.asarray(FORMAT)}
+    _flatten("", saved, arrays)
     file.parent.mkdir(parents=True, exist_ok=True)
     with replacing(file, sync=True) as stream:
         np.savez(stream, allow_pickle=False, **arrays)
@@ -115,37 +104,39 @@ def read(path: str | Path) -> SavedSpace:
         raise SpaceFileError(f"{file}: no such file. Make one with: ic vspace train") from error
     except (OSError, ValueError, EOFError, zipfile.BadZipFile, AttributeError, NotImplementedError) as error:
         raise SpaceFileError(f"{file}: damaged, or not a saved virtual space: {error}") from error
+    if (found := str(arrays.get("format", "not a saved virtual space"))) != FORMAT:
+        raise SpaceFileError(f"{file}: {found}; this program reads {FORMAT}. Train it again with: ic vspace train")
     try:
-        head = json.loads(arrays["head"].tobytes())
-        if (head["format"], head["version"]) != (FORMAT, VERSION):
-            found = f"{head['format']!r}, version {head['version']}; this program reads version {VERSION}"
-            raise SpaceFileError(f"{file}: {found}. Train it again with: ic vspace train")
-        priors = tuple(_group(PanoramaPrior, f"prior.{number}", arrays) for number in range(head["keyframes"]))
-        if not priors:
-            raise SpaceFileError(f"{file}: holds no keyframe. Train it again with: ic vspace train")
-        return SavedSpace(
-            _built(VirtualSpaceConfig, head["config"]),
-            priors,
-            arrays["gains"],
-            _group(Lattice, "lattice", arrays),
-            _group(FieldParameters, "parameters", arrays),
-            _built(TrainingProgress, head["progress"]),
-        )
-    except SpaceFileError:
-        raise
+        saved: SavedSpace = _built("", SavedSpace, arrays)
     except (KeyError, TypeError, ValueError) as error:
-        raise SpaceFileError(f"{file}: not a saved virtual space of this program: {error}") from error
+        raise SpaceFileError(f"{file}: damaged: {error}. Train it again with: ic vspace train") from error
+    if not saved.priors:
+        raise SpaceFileError(f"{file}: holds no keyframe. Train it again with: ic vspace train")
+    return saved
 
 
-def _group(kind: type[Any], group: str, arrays: dict[str, NDArray[Any]]) -> Any:
-    """Build a dataclass of arrays and numbers."""
-    values = {field.name: arrays[f"{group}.{field.name}"] for field in dataclasses.fields(kind)}
-    return kind(**{name: value.item() if value.ndim == 0 else value for name, value in values.items()})
+def _flatten(name: str, value: Any, arrays: Arrays) -> None:
+    """Enter a dataclass, field by field, and tuples of dataclasses into ``arrays``, by dotted names."""
+    if dataclasses.is_dataclass(value):
+        for field in dataclasses.fields(value):
+            _flatten(f"{name}.{field.name}", getattr(value, field.name), arrays)
+    elif isinstance(value, tuple) and value and dataclasses.is_dataclass(value[0]):
+        for number, one in enumerate(value):
+            _flatten(f"{name}.{number}", one, arrays)
+    else:
+        arrays[name] = np.asarray(value)
 
 
-def _built(kind: Any, value: Any) -> Any:
-    """Build a configuration from nested dictionaries; an unknown key is a TypeError."""
+def _built(name: str, kind: Any, arrays: Arrays) -> Any:
+    """Build what ``_flatten`` has entered, by its type."""
     if dataclasses.is_dataclass(kind):
         hints = get_type_hints(kind)
-        return kind(**{key: _built(hints.get(key), part) for key, part in value.items()})  # type: ignore[operator]
-    return tuple(value) if isinstance(value, list) else value  # JSON knows no tuples
+        return kind(**{field.name: _built(f"{name}.{field.name}", hints[field.name], arrays)
+                       for field in dataclasses.fields(kind)})  # type: ignore[operator]  # fmt: skip
+    if get_origin(kind) is tuple and dataclasses.is_dataclass(one := get_args(kind)[0]):
+        numbers = {int(key.removeprefix(f"{name}.").partition(".")[0]) for key in arrays if key.startswith(f"{name}.")}
+        return tuple(_built(f"{name}.{number}", one, arrays) for number in sorted(numbers))
+    value = arrays[name]
+    if get_origin(kind) is tuple:
+        return tuple(value.tolist())
+    return value.item() if value.ndim == 0 else value
