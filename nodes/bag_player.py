@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import threading
 import time
-from pathlib import Path
 from typing import Any
 
 from instant_ic.bag import BagError, BagMessage
@@ -31,7 +30,7 @@ class BagPlayerNode(Node[BagPlayerConfig]):
 
     def setup(self) -> None:
         try:
-            self.player = BagPlayer(Path(self.config.bag).expanduser(), self.config)
+            self.player = BagPlayer(self.config)
             self.check_base()
         except BagError as error:
             if self.player is not None:

@@ -46,11 +46,7 @@ class _File:
         """Do nothing: nothing is buffered."""
 
     def close(self) -> None:
-        """Write the file to the disk itself and close it.
-
-        Raises:
-            OSError: the disk failed; the file is closed.
-        """
+        """Write the file to the disk itself and close it."""
         try:
             os.fsync(self.fd)
         finally:
@@ -72,7 +68,7 @@ class McapWriter:
         span_ns: first and last stamp in complete chunks; (0, 0) if there are none.
 
     Raises:
-        OSError: the file cannot be created.
+        OSError: in all methods: the disk is full, or failed; the file ends with its last complete chunk.
     """
 
     def __init__(self, path: Path, topics: Topics, compressed: bool = False) -> None:
@@ -110,11 +106,7 @@ class McapWriter:
         return lost
 
     def add_topic(self, topic: Topic) -> int:
-        """Add a topic with its type, once; return its number in this file.
-
-        Raises:
-            OSError: the disk is full.
-        """
+        """Add a topic with its type, once; return its number in this file."""
         if topic not in self._channels:
             qos, schema = self._topics[topic]
             if schema.name not in self._schemas:
@@ -126,11 +118,7 @@ class McapWriter:
         return self._channels[topic]
 
     def write(self, topic: Topic, stamp_ns: int, payload: Buffer) -> None:
-        """Append one message.
-
-        Raises:
-            OSError: the disk is full; the file ends with the last complete chunk.
-        """
+        """Append one message."""
         self.given[topic] += 1
         if self.first_ns is None:
             self.first_ns = stamp_ns
@@ -140,37 +128,21 @@ class McapWriter:
         self._put(self._writer.add_message, channel, stamp_ns, payload, stamp_ns)
 
     def add_metadata(self, name: str, values: Mapping[str, str]) -> None:
-        """Write a metadata record before the open chunk.
-
-        Raises:
-            OSError: the disk is full.
-        """
+        """Write a metadata record before the open chunk."""
         opened, self._open = self._open, []  # this completes no chunk
         self._put(self._writer.add_metadata, name, dict(values))
         self._open = opened
 
     def flush(self) -> None:
-        """Write the open chunk. Its messages then survive the end of this process.
-
-        Raises:
-            OSError: the disk is full; the chunk is lost and the file ends with the previous chunk.
-        """
+        """Write the open chunk. Its messages then survive the end of this process."""
         self._put(self._writer.flush)
 
     def sync(self) -> None:
-        """Wait until all complete chunks are on the disk itself.
-
-        Raises:
-            OSError: the disk failed.
-        """
+        """Wait until all complete chunks are on the disk itself."""
         self._put(os.fdatasync, self._file.fd)
 
     def finish(self) -> None:
-        """Write the open chunk, index and footer, to the disk itself, and close the file.
-
-        Raises:
-            OSError: the disk is full, or failed.
-        """
+        """Write the open chunk, index and footer, to the disk itself, and close the file."""
         self.flush()
         self._put(self._writer.finish)
         self._file.close()

@@ -29,10 +29,11 @@ RATES = (0.01, 100.0)
 
 
 @dataclass(frozen=True)
-class PlayOptions(Checked):
-    """How a bag is played.
+class BagPlayerConfig(Checked):
+    """Parameters of ``bag_player``.
 
     Attributes:
+        bag: folder of the bag, or a ``.mcap`` or ``.db3`` file.
         rate: 2 plays twice as fast.
         start_offset_s: seconds to skip at the start; latched messages from the skipped part are still published.
         duration_s: seconds of the bag to play; 0 plays to the end.
@@ -40,23 +41,6 @@ class PlayOptions(Checked):
         start_paused: wait at the start until resumed or stepped.
         topics: names or patterns of the topics to play; empty plays everything.
         exclude: names or patterns of the topics to leave out.
-    """
-
-    rate: Annotated[float, Range(*RATES)] = 1.0
-    start_offset_s: NotNegative = 0.0
-    duration_s: NotNegative = 0.0
-    loop: bool = False
-    start_paused: bool = False
-    topics: tuple[str, ...] = ()
-    exclude: tuple[str, ...] = ()
-
-
-@dataclass(frozen=True)
-class BagPlayerConfig(PlayOptions):
-    """Parameters of ``bag_player``, in addition to those of playing.
-
-    Attributes:
-        bag: folder of the bag, or a ``.mcap`` or ``.db3`` file.
         drop_transforms: child frames whose transforms are left out of ``/tf`` because another node broadcasts them.
         publish_clock: whether to publish ``/clock``.
         delay_s: seconds for which the time stands still at the start, so that subscribers find the topics.
@@ -65,6 +49,13 @@ class BagPlayerConfig(PlayOptions):
     """
 
     bag: str = ""
+    rate: Annotated[float, Range(*RATES)] = 1.0
+    start_offset_s: NotNegative = 0.0
+    duration_s: NotNegative = 0.0
+    loop: bool = False
+    start_paused: bool = False
+    topics: tuple[str, ...] = ()
+    exclude: tuple[str, ...] = ()
     drop_transforms: tuple[str, ...] = ()
     publish_clock: bool = True
     delay_s: NotNegative = 0.5
@@ -84,10 +75,10 @@ class BagPlayer:
         BagError: there is no bag, or it has nothing to play.
     """
 
-    def __init__(self, path: Path, options: PlayOptions) -> None:
+    def __init__(self, options: BagPlayerConfig) -> None:
         self.options = options
         choice = TopicChoice(options.topics, options.exclude)
-        self._reader = BagReader(path)
+        self._reader = BagReader(Path(options.bag).expanduser())
         self.left_out: dict[str, str] = {}
         """Topics and types that are not sent, with the reason."""
         chosen: dict[str, TopicSummary] = {}
@@ -109,10 +100,10 @@ class BagPlayer:
         if not self.topics:
             self._reader.close()
             why = "".join(f"; {topic}: {words}" for topic, words in self.left_out.items())
-            raise BagError(f"bag {path} has none of the selected topics{why}")
+            raise BagError(f"bag {options.bag} has none of the selected topics{why}")
         if self.start_ns > self.end_ns:
             self._reader.close()
-            raise BagError(f"bag {path} ends before start_offset_s = {options.start_offset_s}")
+            raise BagError(f"bag {options.bag} ends before start_offset_s = {options.start_offset_s}")
         self.position_ns = self.start_ns
         """Current time in the bag."""
         self.sent = 0

@@ -123,10 +123,6 @@ class Recorder:
             self.bag = self._open(path)
 
     @property
-    def topics(self) -> Collection[str]:
-        return self._losses.keys()
-
-    @property
     def failed(self) -> bool:
         """True if the last bag or a snapshot is incomplete."""
         states = [snapshot.state for snapshot in self.snapshots]
@@ -248,9 +244,6 @@ class Recorder:
             text = self._summary() + (f"; lost: {counts_text(missing)}" if missing else "")
             values = {topic.strip("/"): count for topic, count in missing.items()}
             yield Diagnosis("bag", Level.WARN if now_lost else Level.OK, text, values)
-        if self.bag is not None and (unknown := self.bag.unknown_types):
-            named = ", ".join(f"{type_name} ({topic})" for type_name, topic in sorted(unknown.items()))
-            yield Diagnosis("types", Level.WARN, f"recorded without type definition, which is unknown here: {named}")
 
     def close(self, timeout_s: float = 30.0) -> None:
         """Complete all bags; their metadata contain the losses and the nodes' parameters.

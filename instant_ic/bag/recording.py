@@ -129,11 +129,6 @@ class Recording:
         gone = self.not_written if self._error else None
         return f"{self._error}; not recorded: {counts_text(gone)}" if gone else self._error
 
-    @property
-    def unknown_types(self) -> dict[str, str]:
-        """Types recorded without a definition, with one of their topics each."""
-        return dict(self._writer.unknown_types)
-
     def put(self, message: BagMessage) -> None:
         """Queue a message; never waits. Latched values before the first other message get its stamp."""
         if self._ended_s:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import logging
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -15,6 +16,8 @@ from instant_ic.bag.metadata import Topics, schema_or_unknown, write_metadata
 from instant_ic.bus.qos import SENSOR, QoS
 from instant_ic.util.closing import Closing
 from instant_ic.util.private import make_folder, sync_folder
+
+log = logging.getLogger(__name__)
 
 _FULL = (errno.ENOSPC, errno.EDQUOT)
 
@@ -35,7 +38,9 @@ class BagWriter(Closing):
         max_duration_s: duration by message stamps after which a new file starts; 0 sets no limit.
 
     Raises:
-        BagError: the folder exists, or cannot be created.
+        DiskFullError: in all methods: the disk is full; lost messages are in ``lost``. The current file is given up at
+            its last complete chunk. The bag can be closed, or continued in another file once there is room.
+        BagError: in all methods: the disk failed; here also: the folder exists, or cannot be created.
     """
 
     def __init__(
@@ -50,8 +55,6 @@ class BagWriter(Closing):
         self.max_bytes = max_bytes
         self.max_duration_ns = int(max_duration_s * 1e9)
         self.bytes = 0
-        self.unknown_types: dict[str, str] = {}
-        """Type → topic recorded without a definition because the type is unknown."""
         self.lost: Counter[str] = Counter()
         """Messages by topic that were given to :meth:`write` and did not reach the disk; replaced, never changed."""
         self._topics: Topics = {}
@@ -100,11 +103,6 @@ class BagWriter(Closing):
             qos: QoS of the topic; used the first time that the topic appears.
             schema: definition of the type; default ours. Without one, the bytes are still recorded.
             publisher: name of the publisher; each publisher of a latched topic has its own current value.
-
-        Raises:
-            DiskFullError: lost messages are in ``lost``; the file has no index. The bag can be closed, or continued
-                in another file once there is room.
-            BagError: the file cannot be written; lost messages are in ``lost``.
         """
         if self._closed:
             raise BagError(f"bag {self.path} is closed")
@@ -128,11 +126,7 @@ class BagWriter(Closing):
         self._latched.put(message)
 
     def add_topic(self, topic: str, type_name: str, qos: QoS) -> None:
-        """Add a topic that may never carry a message.
-
-        Raises:
-            BagError: the disk is full.
-        """
+        """Add a topic that may never carry a message."""
         self._add((topic, type_name), qos)
         if self._file is not None:
             with self._giving_up(topic):
@@ -142,43 +136,26 @@ class BagWriter(Closing):
         self._custom[key] = value
 
     def keep_custom(self) -> None:
-        """Write the current ``custom_data`` into the file itself, for a recovery to read.
-
-        Raises:
-            BagError: the disk is full.
-        """
+        """Write the current ``custom_data`` into the file itself, for a recovery to read."""
         if self._file is not None and self._file.given:
             with self._giving_up("metadata"):
                 self._file.add_metadata(CUSTOM_RECORD, self._custom)
 
     def flush(self) -> None:
-        """Pass all messages so far to the operating system. They then survive the end of this process.
-
-        Raises:
-            BagError: the disk is full.
-        """
+        """Pass all messages so far to the operating system. They then survive the end of this process."""
         if self._file is not None:
             with self._giving_up("flush"):
                 self._file.flush()
 
     def sync(self) -> None:
-        """Write all flushed messages to the disk itself. They then survive a power failure.
-
-        Raises:
-            BagError: the disk failed.
-        """
+        """Write all flushed messages to the disk itself. They then survive a power failure."""
         if self._file is not None:
             with self._giving_up("sync"):
                 self._file.sync()
                 sync_folder(self.path)
 
     def end_file(self) -> None:
-        """Complete the current file and list it in ``metadata.yaml``; the next message starts another.
-
-        Raises:
-            DiskFullError: the file did not fit; it is not listed, and can be recovered.
-            BagError: the file cannot be completed.
-        """
+        """Complete the current file and list it in ``metadata.yaml``; the next message starts another."""
         try:
             if self._file is not None:
                 self._finish_file(self._file)
@@ -189,12 +166,7 @@ class BagWriter(Closing):
         self._write_metadata()
 
     def close(self) -> None:
-        """Write index and metadata. Idempotent.
-
-        Raises:
-            DiskFullError: the last messages did not fit; the bag is complete without them.
-            BagError: the bag cannot be completed.
-        """
+        """Write index and metadata. Idempotent."""
         if not self._closed:
             self._closed = True
             self.end_file()
@@ -206,7 +178,7 @@ class BagWriter(Closing):
         if topic not in self._topics:
             schema = schema or schema_or_unknown(topic[1])
             if not schema.encoding:
-                self.unknown_types[topic[1]] = topic[0]
+                log.warning("%s: type %s is unknown here and is recorded without its definition", *topic)
             self._topics[topic] = (qos, schema)
         return self._topics[topic][0]
 
@@ -256,11 +228,7 @@ class BagWriter(Closing):
 
     @contextmanager
     def _giving_up(self, what: str) -> Iterator[None]:
-        """After an error of the disk, count what the current file has lost, and leave it.
-
-        Raises:
-            BagError: the disk is full, or failed.
-        """
+        """After an error of the disk, count what the current file has lost, and leave it."""
         try:
             yield
         except OSError as error:

@@ -9,11 +9,11 @@ import pytest
 
 from instant_ic.bag import BagError, BagMessage, BagWriter, Schema, player
 from instant_ic.bag.metadata import with_hash
-from instant_ic.bag.player import BagPlayer, PlayOptions
+from instant_ic.bag.player import BagPlayer, BagPlayerConfig
 from instant_ic.bus import LATCHED, RELIABLE, SENSOR
 from instant_ic.bus.clock import ManualClock
 from instant_ic.msg import message_type, serialize, transform_message
-from nodes.bag_player import BagPlayerConfig, BagPlayerNode
+from nodes.bag_player import BagPlayerNode
 
 BOOL, TF = "std_msgs/msg/Bool", "tf2_msgs/msg/TFMessage"
 
@@ -56,7 +56,7 @@ def clock_at_20_hz(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(player, "CLOCK_HZ", 20.0)
 
 
-def played(bag: Path, options: PlayOptions, time: FakeTime | None = None) -> list[tuple[float, str, bytes]]:
+def played(bag: Path, time: FakeTime | None = None, **options: Any) -> list[tuple[float, str, bytes]]:
     clock = time or FakeTime()
     began_s = clock.now_s
     sent: list[tuple[float, str, bytes]] = []
@@ -64,7 +64,7 @@ def played(bag: Path, options: PlayOptions, time: FakeTime | None = None) -> lis
     def send(message: BagMessage) -> None:
         sent.append((round(clock.now_s - began_s, 6), message.topic, message.payload))
 
-    player = BagPlayer(bag, options)
+    player = BagPlayer(BagPlayerConfig(bag=str(bag), **options))
     player.play(send, clock, lambda: clock.now_s)  # type: ignore[arg-type]
     player.close()
     return sent
@@ -75,41 +75,41 @@ def scans(sent: list[tuple[float, str, bytes]]) -> list[tuple[float, int]]:
 
 
 def test_pace_of_the_bag_and_twice_as_fast(bag: Path) -> None:
-    sent = played(bag, PlayOptions())
+    sent = played(bag)
     assert scans(sent) == [(0.0, 0), (0.5, 1), (1.0, 2), (1.5, 3), (2.0, 4)]
     assert "/clock" not in {topic for _, topic, _ in sent}
-    assert scans(played(bag, PlayOptions(rate=2.0))) == [(0.0, 0), (0.25, 1), (0.5, 2), (0.75, 3), (1.0, 4)]
+    assert scans(played(bag, rate=2.0)) == [(0.0, 0), (0.25, 1), (0.5, 2), (0.75, 3), (1.0, 4)]
 
 
 def test_start_offset_sends_the_state_that_was_skipped(bag: Path) -> None:
-    sent = played(bag, PlayOptions(start_offset_s=1.0, duration_s=0.5))
+    sent = played(bag, start_offset_s=1.0, duration_s=0.5)
     mounts = [(0.0, "/tf_static", mount("camera")), (0.0, "/tf_static", mount("lidar"))]
     assert sent[:3] == [*mounts, (0.0, "/map", b"new map")]
     assert sent[3:] == [(0.0, "/scan", b"\x02"), (0.5, "/scan", b"\x03")]
 
 
 def test_loop_begins_again_until_stopped(bag: Path) -> None:
-    sent = played(bag, PlayOptions(loop=True, topics=("/scan",)), FakeTime(stop_at_s=50.0 + 4.2))
+    sent = played(bag, FakeTime(stop_at_s=50.0 + 4.2), loop=True, topics=("/scan",))
     assert [value for _, value in scans(sent)] == [0, 1, 2, 3, 4, 0, 1, 2, 3, 4, 0]
 
 
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (PlayOptions(topics=("/nothing",)), "none of the selected topics"),
-        (PlayOptions(start_offset_s=60.0), "ends before start_offset_s = 60"),
+        ({"topics": ("/nothing",)}, "none of the selected topics"),
+        ({"start_offset_s": 60.0}, "ends before start_offset_s = 60"),
     ],
 )
-def test_nothing_to_play_is_told(bag: Path, options: PlayOptions, message: str) -> None:
+def test_nothing_to_play_is_told(bag: Path, options: dict[str, Any], message: str) -> None:
     with pytest.raises(BagError, match=message):
-        BagPlayer(bag, options)
+        BagPlayer(BagPlayerConfig(bag=str(bag), **options))
 
 
 class Steered:
     """Plays on a clock of its own; ``at`` lets controls act at times of it."""
 
-    def __init__(self, bag: Path, options: PlayOptions, at: dict[float, Callable[[BagPlayer], None]]) -> None:
-        self.player = BagPlayer(bag, options)
+    def __init__(self, bag: Path, options: dict[str, Any], at: dict[float, Callable[[BagPlayer], None]]) -> None:
+        self.player = BagPlayer(BagPlayerConfig(bag=str(bag), **options))
         self.sent: list[tuple[float, int]] = []
         self.clock: list[tuple[float, float]] = []
         self.now_s = 50.0
@@ -140,7 +140,7 @@ SCANS = ("/scan",)  # at 0, 0.5, 1, 1.5, 2 s
 
 
 def steered(bag: Path, at: dict[float, Callable[[BagPlayer], None]], **options: Any) -> Steered:
-    return Steered(bag, PlayOptions(topics=SCANS, **options), at)
+    return Steered(bag, {"topics": SCANS, **options}, at)
 
 
 def near(sent: list[tuple[float, int]]) -> list[tuple[float, int]]:
@@ -189,7 +189,7 @@ def test_of_a_topic_with_two_types_one_is_played(tmp_path: Path) -> None:
         writer.write("/a", TF, b"tf", 1, SENSOR)
         for stamp_ns in (2, 3):
             writer.write("/a", BOOL, b"b", stamp_ns, SENSOR)
-    player = BagPlayer(tmp_path / "bag", PlayOptions())
+    player = BagPlayer(BagPlayerConfig(bag=str(tmp_path / "bag")))
     assert [(t.topic, t.type_name) for t in player.topics] == [("/a", BOOL)]
     assert player.left_out == {f"/a ({TF}, 1 messages)": "the topic also has another type"}
     sent: list[bytes] = []
@@ -207,7 +207,7 @@ def test_damage_found_while_playing_is_told(tmp_path: Path) -> None:
     data = bytearray(file.read_bytes())
     data[data.find(bytes([4]) * 1000) + 10] ^= 0xFF
     file.write_bytes(data)
-    player = BagPlayer(tmp_path / "bag", PlayOptions())
+    player = BagPlayer(BagPlayerConfig(bag=str(tmp_path / "bag")))
     sent: list[int] = []
     with pytest.raises(BagError, match=r"is damaged.*ic bag recover"):
         player.play(lambda message: sent.append(message.payload[0]), threading.Event())
@@ -222,11 +222,11 @@ def test_types_that_cannot_be_sent_are_named(tmp_path: Path) -> None:
         writer.write("/unknown", "their_msgs/msg/Odd", b"u", 1, SENSOR)
         writer.write("/other", BOOL, b"o", 1, SENSOR, theirs)
     with pytest.raises(BagError, match=r"/unknown \(their_msgs/msg/Odd, 1 messages\): its type is unknown"):
-        BagPlayer(tmp_path / "bag", PlayOptions())
+        BagPlayer(BagPlayerConfig(bag=str(tmp_path / "bag")))
     with BagWriter(tmp_path / "more") as writer:
         writer.write("/cells", new.name, b"c", 1, SENSOR, new)
         writer.write("/other", BOOL, b"o", 1, SENSOR, theirs)
-    player = BagPlayer(tmp_path / "more", PlayOptions())
+    player = BagPlayer(BagPlayerConfig(bag=str(tmp_path / "more")))
     assert [t.topic for t in player.topics] == ["/cells"]  # its definition is in the bag
     assert player.left_out == {f"/other ({BOOL}, 1 messages)": "the bag defines its type differently"}
     player.close()
