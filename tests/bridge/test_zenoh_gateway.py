@@ -9,7 +9,15 @@ from live_nodes import LiveNode, Neighbour, cdr, wait_for
 
 from instant_ic.bridge.zenoh_format import SENDER_SIZE, Attachment, data_key
 from instant_ic.bridge.zenoh_outgoing import RosPublisher
-from instant_ic.bridge.zenoh_session import ROUTER_DEFAULTS, RosNode, RosSession, ZenohError, load_config, open_zenoh
+from instant_ic.bridge.zenoh_session import (
+    CLIENT_DEFAULTS,
+    ROUTER_DEFAULTS,
+    RosNode,
+    RosSession,
+    ZenohError,
+    load_config,
+    open_zenoh,
+)
 from instant_ic.bus import LATCHED, RELIABLE, SENSOR, NodeError, registry
 from instant_ic.control.robot_lease import Verdict
 from instant_ic.experiments.stack import free_port
@@ -61,14 +69,15 @@ def world(router, tmp_path_factory, monkeypatch):
             return thing
 
         def gateway(self, where, **parameters):
-            config = ZenohGatewayConfig(connect=(router,), **parameters)
+            # A client opens half a second sooner than a peer.
+            config = ZenohGatewayConfig(connect=(router,), **{"mode": "client", **parameters})
             return self.keep(LiveNode(self.run_dir(where), ZenohGatewayNode, config, "zenoh_gateway"))
 
         def neighbour(self, where, name="talker"):
             return self.keep(Neighbour(self.run_dir(where), name))
 
         def session(self):
-            return self.keep(RosSession(load_config("", (router,))))
+            return self.keep(RosSession(load_config("", (router,), defaults=CLIENT_DEFAULTS)))
 
         def topics(self, where):
             return {info.topic for info in registry.list_topics(self.run_dir(where))}
@@ -150,7 +159,7 @@ def test_independent_client_sees_our_topics_types_and_messages(world, sdk):
     from zenoh_ros2_sdk import ROS2Subscriber
     from zenoh_ros2_sdk.discovery import get_topic_info, get_topic_names_and_types
 
-    world.gateway("robot", namespace="robot1", publish=("/chatter", "/scan"))
+    world.gateway("robot", mode="peer", namespace="robot1", publish=("/chatter", "/scan"))
     talker = world.neighbour("robot")
     out = talker.publisher("/chatter", String)
     talker.node.publisher_raw("/scan", "sensor_msgs/msg/LaserScan", SENSOR)
@@ -386,7 +395,12 @@ def test_nobody_but_the_driver_releases_the_emergency_stop_and_everybody_presses
 def test_without_tls_no_command_comes_in_but_the_pressing_of_the_emergency_stop(world, loopback):
     """Loopback is allowed only where the parameter says so and no link can leave the machine: a peer's can."""
     gateway = world.gateway(
-        "robot", namespace="robot1", commands=COMMANDS, subscribe=("/*",), insecure_loopback_commands=loopback
+        "robot",
+        mode="peer",
+        namespace="robot1",
+        commands=COMMANDS,
+        subscribe=("/*",),
+        insecure_loopback_commands=loopback,
     )
     assert "only emergency stops are accepted as commands" in gateway.told("commands")
     assert gateway.node.diagnoses()["commands"][0] == 2
@@ -471,7 +485,7 @@ def test_two_robots_and_a_station_do_not_mix(world):
         LiveNode(
             world.run_dir("station"),
             ZenohGatewayNode,
-            ZenohGatewayConfig(connect=(world.endpoint,), subscribe=("/robot*/chatter",)),
+            ZenohGatewayConfig(mode="client", connect=(world.endpoint,), subscribe=("/robot*/chatter",)),
             "fleet_gateway",
         )
     )
