@@ -17,14 +17,11 @@ from instant_ic.depth.metrics import DepthMetrics, depth_metrics, mean_metrics
 from instant_ic.depth.scaler import ScalerConfig
 from instant_ic.depth.sources import DepthSource, SourceConfig, complete
 from instant_ic.experiments.depth_lidar import RangeErrors, measure
-from instant_ic.geometry.projections import equirect_directions, sample_equirect
 
 if TYPE_CHECKING:
     from instant_ic.depth.model import DepthModel
 
 Floats = NDArray[np.floating]
-_EDGE = 0.2
-"""Relative difference of neighbours above which interpolated depth would lie between two surfaces."""
 _UP = np.array([0.0, 0.0, 1.0])
 
 
@@ -139,7 +136,7 @@ class Evaluator:
     def score(self, name: str, rgb: NDArray[np.uint8], truth_m: Floats | None) -> Scored:
         """Score the depth of a level panorama.
 
-        Metrics are computed at the pixels of the ground truth. A result of another size is interpolated there.
+        Metrics are computed at the pixels of the estimate, with the nearest pixels of the ground truth.
 
         Args:
             name: label for the report.
@@ -165,12 +162,13 @@ class Evaluator:
         seconds = time.perf_counter() - begin
         before = after = share = None
         if truth is not None:
-            known = truth > 0
-            after = depth_metrics(look_up(depth, truth.shape), truth, known)
+            own = nearest(truth, depth.shape)
+            after = depth_metrics(depth, own, own > 0)
             if raw is not None and self.model is not None and self.model.manifest.output_kind == "metric":
-                before = depth_metrics(look_up(raw, truth.shape), truth, known)
+                own_raw = nearest(truth, raw.shape)
+                before = depth_metrics(raw, own_raw, own_raw > 0)
             if sigma is not None:
-                share = _within_sigma(depth, sigma, nearest(truth, depth.shape))
+                share = _within_sigma(depth, sigma, own)
         return Scored(name, rgb, depth, truth, before, after, share, seconds, fit)
 
     def _depth(
@@ -200,20 +198,6 @@ def _known_depth(name: str, truth_m: Floats) -> NDArray[np.float32]:
     if not truth.any():
         raise DepthEvaluationError(f"{name}: the ground truth has no valid pixel")
     return truth
-
-
-def look_up(depth: Floats, size: tuple[int, ...]) -> NDArray[np.float32]:
-    """Resample equirect depth to (H, W): bilinear in inverse depth, nearest pixel at depth edges."""
-    if depth.shape == size:
-        return depth.astype(np.float32)
-    inverse = np.where(depth > 0, 1.0 / np.where(depth > 0, depth, 1.0), 0.0)
-    around = np.pad(inverse, 1, mode="edge")
-    around[1:-1, 0], around[1:-1, -1] = inverse[:, -1], inverse[:, 0]
-    views = np.lib.stride_tricks.sliding_window_view(around, (3, 3))
-    smooth = views.min(axis=(2, 3)) > (1 - _EDGE) * views.max(axis=(2, 3))
-    between = sample_equirect(inverse, equirect_directions(size[1], size[0]))
-    use = nearest(smooth, size)
-    return np.where(use, 1.0 / np.where(use, between, 1.0), nearest(depth, size)).astype(np.float32)
 
 
 def nearest(values: NDArray[Any], size: tuple[int, ...]) -> NDArray[Any]:

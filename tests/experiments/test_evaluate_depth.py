@@ -18,7 +18,6 @@ from instant_ic.experiments.depth import (
     DepthSettings,
     Evaluator,
     LidarSettings,
-    look_up,
     pair,
     report,
 )
@@ -118,15 +117,6 @@ def test_a_measured_picture_agrees_with_rays_in_the_world():
     assert np.quantile(np.abs(range_m - true) / true, 0.95) < 0.02
     everything = measure_world(renderer, pose, LIDAR_M, CAMERA_M, RangeErrors(noise_m=0))
     assert 0.8 * len(everything) / 900 < len(points) / 256 <= 16
-
-
-def test_looked_up_depth_keeps_planes_and_edges():
-    small, large = box_room(), box_room((256, 512))
-    up = look_up(small, large.shape)
-    assert np.quantile(np.abs(up - large) / large, 0.95) < 0.01
-    step = np.where(np.arange(128) < 64, 1.0, 3.0)[None].repeat(64, axis=0)
-    assert set(np.unique(look_up(step, (256, 512)))) == {1.0, 3.0}
-    assert np.array_equal(look_up(small, SIZE), small)
 
 
 class KnownModel:
