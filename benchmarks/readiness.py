@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
 """The expected PSNR of the virtual space against the one on the operator's page; prints JSON.
 
-    python benchmarks/readiness.py [--world W[,W]] [--seed S] [--episodes N] [--fit] [--plot OUT.png]
+    python benchmarks/readiness.py [--world W[,W]] [--seed S] [--episodes N] [--fit]
 
 The frames are those of ``ic evaluate illusion``. ``--fit`` prints the base and the gains of ``vspace/readiness.py``
 that fit them best: fit on some worlds and seeds, test on others.
@@ -9,7 +9,6 @@ that fit them best: fit on some worlds and seeds, test on others.
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -19,7 +18,6 @@ from reporting import parser_for, report
 from instant_ic.control.warmup import warm_up
 from instant_ic.experiments.illusion import TeleopSettings
 from instant_ic.experiments.illusion_stack import FOV_RAD, LIVE, FilmedStack, IllusionFrame
-from instant_ic.experiments.plots import new_figure, save_figure
 from instant_ic.experiments.teleop import run_episode
 from instant_ic.vspace import readiness
 from instant_ic.vspace.view import View, perspective_rays
@@ -85,26 +83,12 @@ def fit(rows: list[dict[str, Any]]) -> list[float]:
     return [float(gains[0] * 1e-3), *map(float, gains[1:])]
 
 
-def save_plot(path: Path, frames: dict[str, list[dict[str, Any]]]) -> None:
-    """Save expected against measured PSNR of the frames of each world, with the target's limits of 2 dB."""
-    figure, axes = new_figure(1, 1, (6.4, 6.0))
-    plot, ends = axes[0][0], np.array([15.0, 34.0])
-    for name, rows in frames.items():
-        plot.plot([row["psnr_db"] for row in rows], [row["expected_db"] for row in rows], ".", label=name)
-    for error, style in ((-2, "k:"), (0, "k-"), (2, "k:")):
-        plot.plot(ends, ends + error, style, linewidth=0.8)
-    plot.set(xlabel="live PSNR, dB", ylabel="expected PSNR, dB", xlim=ends, ylim=ends)
-    plot.legend()
-    save_figure(figure, path)
-
-
 def main() -> None:
     parser = parser_for(__doc__)
     parser.add_argument("--world", default="corridors", help="worlds, by comma (default corridors)")
     parser.add_argument("--seed", type=int, default=0, help="seed of the courses (default 0)")
     parser.add_argument("--episodes", type=int, default=4, help="courses in each world (default 4)")
     parser.add_argument("--fit", action="store_true", help="fit base and gains to these frames")
-    parser.add_argument("--plot", type=Path, help="PNG of expected against measured PSNR")
     arguments = parser.parse_args()
     warm_up()
     frames = {world: samples(world, arguments.seed, arguments.episodes) for world in arguments.world.split(",")}
@@ -119,8 +103,6 @@ def main() -> None:
             "rms_error_db": round(float(np.sqrt(np.mean(error**2))), 2),
             "share_within_2_db": round(float(np.mean(np.abs(error) <= 2)), 3),
         }
-    if arguments.plot:
-        save_plot(arguments.plot, frames)
     if arguments.fit:
         result["base_and_gains"] = fit([row for rows in frames.values() for row in rows])
     report(result, arguments.json)

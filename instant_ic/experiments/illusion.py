@@ -21,14 +21,13 @@ from instant_ic.experiments.illusion_stack import (
     FRAME_S,
     HEIGHT,
     LIVE,
-    SOURCES,
     TRUE_DEPTH,
     WIDTH,
     FilmedStack,
     IllusionFrame,
     StackConfig,
 )
-from instant_ic.experiments.plots import image_strip, new_figure, save_figure
+from instant_ic.experiments.plots import image_strip
 from instant_ic.experiments.processes import run_all
 from instant_ic.experiments.results import finite
 from instant_ic.experiments.teleop import TeleopSettings, run_episode
@@ -37,7 +36,6 @@ STEP_M = 0.5
 """Width of a row of ``by_distance``."""
 _TILE_PX = 400
 _COLUMNS = {LIVE: "shown", "truth": "true", TRUE_DEPTH: "with true depth"}
-_COLOURS = {LIVE: "tab:red", TRUE_DEPTH: "tab:blue"}
 Still = dict[str, NDArray[np.uint8]]
 """Images of one frame: ``truth`` and each source."""
 
@@ -170,24 +168,3 @@ def save_strip(path: Path, films: Sequence[Film]) -> None:
     strip = image_strip(list(_COLUMNS.values()), rows, _TILE_PX)
     if not cv2.imwrite(str(path), strip[..., ::-1]):
         raise ValueError(f"{path}: the strip cannot be written")
-
-
-def save_plot(path: Path, report: dict[str, Any]) -> None:
-    """Save PSNR against distance for all sources: each frame, and the means."""
-    figure, axes = new_figure(1, 1, (7.0, 4.6))
-    axis = axes[0, 0]
-    known = [frame for frame in report["each"] if frame["distance_m"] is not None]
-    for source in SOURCES:
-        colour = _COLOURS[source]
-        psnr_db = [frame["scores"][source]["psnr_db"] for frame in known]
-        axis.plot([frame["distance_m"] for frame in known], psnr_db, ".", color=colour, alpha=0.25, markersize=4)
-        rows = (report if source == LIVE else report[source])["by_distance"]
-        means_db = [row["psnr_mean_db"] for row in rows]
-        axis.plot([row["distance_m"] for row in rows], means_db, color=colour, label=_COLUMNS[source])
-    axis.axvline(0.0, color="0.6", linewidth=0.8)
-    axis.set(xlabel="metres behind the obstacle's near face", ylabel="PSNR, dB")
-    axis.grid(alpha=0.3)
-    axis.legend(fontsize=8)
-    name = Path(str(report["world"])).name
-    figure.suptitle(f"{name}, {report['episodes']} episode(s), {report['frames']} frames", fontsize=10)
-    save_figure(figure, path)

@@ -34,6 +34,7 @@ from instant_ic.experiments.teleop_stack import (
 from instant_ic.experiments.teleop_worlds import RANDOM_CORRIDORS, Course, floor_plan, make_course
 from instant_ic.geometry.image_quality import psnr_db
 from instant_ic.geometry.poses import pose_matrix
+from instant_ic.util.limits import decode_rgb
 
 if TYPE_CHECKING:
     from instant_ic.sim.world import World
@@ -174,7 +175,7 @@ class _Episode:
 
     def _psnr_db(self, before: Shown, after: Shown) -> float:
         view, photo = (before, after) if before.virtual else (after, before)
-        rgb = decode(view.jpeg)
+        rgb = decode_rgb(view.jpeg)
         return psnr_db(rgb, photograph(self.stack, photo, rgb.shape[1], rgb.shape[0], view.fov_rad))
 
 
@@ -182,20 +183,6 @@ def photograph(stack: SimulatedStack, shown: Shown, width: int, height: int, fov
     """Render the camera's image as the page shows it: taken from its own position, rotated to the heading."""
     pose = pose_matrix(shown.pose[0], shown.pose[1], CAMERA_HEIGHT_M, 0.0, 0.0, shown.heading)
     return stack.simulation.renderer.render_perspective(pose, width, height, fov_rad).rgb
-
-
-def decode(jpeg: bytes) -> NDArray[np.uint8]:
-    """Decode a JPEG to (H, W, 3) RGB.
-
-    Raises:
-        ValueError: not a JPEG.
-    """
-    import cv2
-
-    picture = cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR) if jpeg else None
-    if picture is None:
-        raise ValueError(f"a rendered view of {len(jpeg)} bytes cannot be decoded")
-    return np.asarray(picture[..., ::-1])
 
 
 def run_episode(

@@ -18,8 +18,9 @@ from instant_ic.experiments.lab import Options, Result, Unit
 from instant_ic.experiments.plots import jpeg
 from instant_ic.experiments.recorded_drive import SIZE, Moment, read_drive, still_times
 from instant_ic.experiments.report import Answer, Figure, Part, Section, Table, Text, image_address
-from instant_ic.experiments.teleop import TeleopSettings, decode, photograph, run_episode
+from instant_ic.experiments.teleop import TeleopSettings, photograph, run_episode
 from instant_ic.experiments.teleop_plot import save_plot
+from instant_ic.util.limits import decode_rgb
 
 _FRAME_S = 0.25
 
@@ -39,7 +40,7 @@ class _Recorded(FilmedStack):
             return
         self._next_still_s = self.time_s + _FRAME_S - 1e-6
         shown = self.log.pictures[-1]
-        rgb = decode(shown.jpeg) if shown.virtual else photograph(self, shown, *SIZE, math.pi / 2)
+        rgb = decode_rgb(shown.jpeg) if shown.virtual else photograph(self, shown, *SIZE, math.pi / 2)
         self.frames.append(Moment(self.time_s, shown.virtual, cv2.resize(rgb, SIZE, interpolation=cv2.INTER_AREA)))
 
 

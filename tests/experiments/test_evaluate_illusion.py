@@ -14,7 +14,7 @@ import pytest
 
 from instant_ic.cli.main import main
 from instant_ic.experiments import illusion, teleop, teleop_worlds
-from instant_ic.experiments.illusion import save_plot, save_strip
+from instant_ic.experiments.illusion import save_strip
 from instant_ic.experiments.illusion_stack import LIVE, SOURCES, TRUE_DEPTH, FilmedStack, IllusionFrame, Passage, Score
 from instant_ic.experiments.results import save_json
 from instant_ic.experiments.teleop_stack import SimulatedStack, StackConfig
@@ -109,7 +109,7 @@ def test_figures_by_hand() -> None:
         (["--episodes", "0"], "episodes must be at least 1"),
         (["--world", "nowhere"], "neither corridor"),
         (["--jobs", "0"], "jobs must be at least 1"),
-        (["--strip", "strip.jpg"], "must end in .png"),
+        (["--plot", "strip.jpg"], "must end in .png"),
         (["--plot", "/no/such/folder/plot.png"], "does not exist"),
         (["--timeout", "0"], "--timeout must be > 0"),
         (["-p", "no_node.key:=1"], "expected NODE.KEY:=VALUE"),
@@ -165,7 +165,5 @@ def test_a_short_film(corridor: teleop_worlds.Course, tmp_path: Path) -> None:
     save_strip(tmp_path / "strip.png", [first])
     strip = cv2.imread(str(tmp_path / "strip.png"))
     assert strip.shape == (24 + 225 * len(rows), 64 + 3 * 400, 3) and strip.std() > 20
-    save_plot(tmp_path / "plot.png", figures)
-    assert cv2.imread(str(tmp_path / "plot.png")).std() > 10
     with pytest.raises(ValueError, match="no obstacle was passed"):
         save_strip(tmp_path / "strip.png", [illusion.Film(0)])

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-from pathlib import Path
 from typing import Any
 
 from instant_ic.cli.arguments import verb
@@ -22,21 +21,20 @@ from instant_ic.cli.evaluations import (
 def add_kind(kinds: Any) -> None:
     parser = verb(
         kinds, "illusion", "compare the operator's view inside and behind obstacles with the truth", run,
-        "ic evaluate illusion --episodes 4 --json illusion.json --strip strip.png --plot plot.png",
+        "ic evaluate illusion --episodes 4 --json illusion.json --plot strip.png",
         "The drive of ic evaluate teleop with illusory control. Every frame in which the page shows the virtual "
         "space is rendered by the CPU and compared with the simulator's image from the same pose: with the obstacle "
         "before its near face, without it from there on. The same frames are also rendered with true "
         "depth. Reports PSNR, SSIM and the share that no keyframe has seen. The same seed gives the same figures.",
     )  # fmt: skip
-    add_options(parser, 20, 1, 7200.0, "PSNR by distance")
+    add_options(parser, 20, 1, 7200.0, "rows of frames by distance")
     worlds = "as ic evaluate teleop: corridors (random), or one where the operator drives straight on"
     add_stack_options(parser, worlds, "nerf.space.keyframes:=1")
-    parser.add_argument("--strip", type=Path, metavar="OUT.png", help="write rows of frames by distance here")
 
 
 def run(args: argparse.Namespace) -> int:
     use_one_thread_for_matrices()
-    check_outputs(args, strip=".png", plot=".png")
+    check_outputs(args, plot=".png")
     try:
         with errors_for_the_user():
             return _evaluate(args)
@@ -60,10 +58,8 @@ def _evaluate(args: argparse.Namespace) -> int:
     figures = illusion.report(films, settings)
     if args.json:
         save_json(args.json, figures)
-    if args.plot:
-        illusion.save_plot(args.plot, figures)
     figures.pop("each")
     print_figures(figures)
-    if args.strip:  # last: without an obstacle there is none
-        illusion.save_strip(args.strip, films)
+    if args.plot:  # last: without an obstacle there is no strip
+        illusion.save_strip(args.plot, films)
     return 0
