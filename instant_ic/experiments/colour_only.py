@@ -10,7 +10,9 @@ import math
 import time
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
+from torch.nn import functional
 
 from instant_ic.geometry.image_quality import psnr_of_mse
 from instant_ic.vspace import View, VirtualSpaceConfig
@@ -89,20 +91,22 @@ class ColourOnlyField:
         points = (self._pose[:3, 3] + depth[..., None] * directions[:, None]).astype(np.float32).reshape(-1, 3)
         out = np.empty((len(points), 4), np.float32)
         kernels.query(self._p.table, *self._p.network(), *self._lattice, points, out)
-        field = out.reshape(RAYS, SAMPLES, 4)
-        error, upstream = composite_gradient(field, step, target)
+        field = torch.from_numpy(out.reshape(RAYS, SAMPLES, 4)).requires_grad_()
+        colour, _ = composite(field, torch.from_numpy(step))
+        error = functional.mse_loss(colour, torch.from_numpy(target))
+        (upstream,) = torch.autograd.grad(error, field)
         # The kernel takes a weighted squared error; this target makes its gradient equal the desired one. The weight
         # keeps target and output at the same magnitude, so that their difference keeps its precision.
         weight = np.float32(1 / RAYS)
-        aim = out - (upstream / (2 * weight)).reshape(-1, 4)
+        aim = out - (upstream.numpy() / (2 * weight)).reshape(-1, 4)
         same = np.full(len(points), weight, np.float32)
         table_grad, *network_grads = self._grads
         kernels.gradient(
-            self._p.table, *self._p.network(), *self._lattice, points, aim.astype(np.float32), same, same,
+            self._p.table, *self._p.network(), *self._lattice, points, aim, same, same,
             table_grad, self._touched, *network_grads,
         )  # fmt: skip
         self._adam()
-        return error
+        return float(error.detach())
 
     def _adam(self) -> None:
         table_lr, network_lr = self._schedule.rates()
@@ -121,31 +125,18 @@ class ColourOnlyField:
         """Render a perspective image; depth is the mean along the ray, confidence its opacity."""
         check_size(width, height)
         rays = perspective_rays(checked_pose(map_from_camera), width, height, fov_rad)
-        count = width * height
         depth, step = _samples(1, _DRAWN_SAMPLES, np.full((1, _DRAWN_SAMPLES), 0.5))
-        left = np.ones(count, np.float32)
-        colour, mean_depth = np.zeros((count, 3), np.float32), np.zeros(count, np.float32)
-        for i in range(_DRAWN_SAMPLES):
-            active = np.flatnonzero(left > 0.005)
-            if not len(active):
-                break
-            points = rays.origin + np.float32(depth[0, i]) * rays.directions[active]
-            out = np.empty((len(active), 4), np.float32)
-            kernels.query(self._p.table, *self._p.network(), *self._lattice, points.astype(np.float32), out)
-            alpha = 1 - np.exp(-density(out[:, 3]) * np.float32(step[0, i]))
-            weight = left[active] * alpha
-            colour[active] += weight[:, None] * (out[:, :3] + np.float32(0.5))
-            mean_depth[active] += weight * np.float32(depth[0, i])
-            left[active] *= 1 - alpha
-        opacity = 1 - left
-        rgb = np.rint(255 * np.clip(colour, 0, 1)).astype(np.uint8).reshape(height, width, 3)
-        known = np.divide(mean_depth, opacity, out=np.zeros_like(mean_depth), where=opacity > 0.05)
-        return View(rgb, known.reshape(height, width), opacity.reshape(height, width))
-
-
-def density(raw: Floats) -> Floats:
-    """Return the density in 1/m from the network's fourth output: a bounded exponential as in instant-ngp."""
-    return np.asarray(np.exp(np.clip(raw, -10, 6)), np.float32)
+        parts = []
+        for directions in np.array_split(rays.directions, math.ceil(width * height / 8192)):
+            points = (rays.origin + depth[..., None] * directions[:, None]).astype(np.float32).reshape(-1, 3)
+            out = np.empty((len(points), 4), np.float32)
+            kernels.query(self._p.table, *self._p.network(), *self._lattice, points, out)
+            colour, weight = composite(torch.from_numpy(out.reshape(-1, _DRAWN_SAMPLES, 4)), torch.from_numpy(step))
+            opacity = weight.sum(dim=1)
+            mean_depth = (weight @ torch.from_numpy(depth[0])) / opacity.clamp(min=0.05)
+            parts.append(torch.column_stack([colour + 0.5 * opacity[:, None], mean_depth, opacity]).numpy())
+        image = np.concatenate(parts).reshape(height, width, 5)
+        return View(np.rint(255 * np.clip(image[..., :3], 0, 1)).astype(np.uint8), image[..., 3], image[..., 4])
 
 
 def _samples(rays: int, samples: int, place: NDArray[np.floating]) -> tuple[Floats, Floats]:
@@ -157,29 +148,17 @@ def _samples(rays: int, samples: int, place: NDArray[np.floating]) -> tuple[Floa
     return depth.astype(np.float32), step.astype(np.float32)
 
 
-def composite_gradient(field: Floats, step: Floats, target: Floats) -> tuple[float, Floats]:
-    """Return the mean squared colour error of composited rays, and its gradient by the field's outputs.
+def composite(field: torch.Tensor, step: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """Composite samples along rays (paper, III.B); the density is a bounded exponential as in instant-ngp.
 
     Args:
-        field: colours minus 0.5 and raw density of the samples, (N, S, 4).
-        step: lengths of the samples' intervals in metres, (N, S).
-        target: colours of the rays minus 0.5, (N, 3).
+        field: colours minus 0.5 and logarithm of the density in 1/m of the samples, (N, S, 4).
+        step: lengths of the samples' intervals in metres, (N, S) or (1, S).
 
     Returns:
-        The error, and the gradient (N, S, 4).
+        Colours of the rays minus 0.5 times their opacity, (N, 3), and weights of the samples, (N, S).
     """
-    colour, sigma = field[..., :3], density(field[..., 3])
-    keep = np.exp(-sigma * step)
-    left = np.cumprod(keep, axis=1)
-    before = np.concatenate([np.ones_like(left[:, :1]), left[:, :-1]], axis=1)
+    left = torch.exp(-torch.cumsum(field[..., 3].clamp(-10, 6).exp() * step, dim=1))
+    before = functional.pad(left[:, :-1], (1, 0), value=1.0)
     weight = before - left
-    difference = (weight[..., None] * colour).sum(axis=1) - target
-    by_colour = 2 * difference / difference.size
-    upstream = np.empty_like(field)
-    upstream[..., :3] = weight[..., None] * by_colour[:, None]
-    shade = (colour * by_colour[:, None]).sum(axis=2)  # (N, S): error per unit of this sample's weight
-    behind = np.cumsum((weight * shade)[:, ::-1], axis=1)[:, ::-1] - weight * shade
-    inside = np.abs(field[..., 3] + 2) < 8  # where the exponential is not clipped
-    # The last sample gets the remaining weight, whatever its density: no gradient there.
-    upstream[..., 3] = np.where(inside, sigma * step * (left * shade - behind), 0)
-    return float(np.mean(difference**2)), upstream
+    return (weight[..., None] * field[..., :3]).sum(dim=1), weight

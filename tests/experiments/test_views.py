@@ -4,9 +4,10 @@ import math
 
 import numpy as np
 import pytest
+import torch
 
 from instant_ic.experiments import vspace, vspace_sources
-from instant_ic.experiments.colour_only import ColourOnlyField, composite_gradient, density
+from instant_ic.experiments.colour_only import ColourOnlyField, composite
 from instant_ic.experiments.vspace import compare, converge, scores
 from instant_ic.experiments.vspace_sources import VspaceSettings
 from instant_ic.experiments.worlds import CAMERA_HEIGHT_M, path_poses
@@ -57,32 +58,11 @@ def test_scores_by_hand():
     assert scores(grey, grey) == (99.0, 1.0)
 
 
-def test_the_gradient_of_compositing_is_that_of_its_error():
-    rng = np.random.default_rng(4)
-    field = rng.normal(0, 0.7, (3, 5, 4)).astype(np.float64)
-    step, target = rng.uniform(0.1, 1.0, (3, 5)), rng.uniform(-0.5, 0.5, (3, 3))
-    step[:, -1] = 1e3
-
-    def error(values):
-        # The rendering sum of the paper, III.B, written out.
-        total = 0.0
-        for n in range(3):
-            left, colour = 1.0, np.zeros(3)
-            for i in range(5):
-                alpha = 1 - math.exp(-math.exp(values[n, i, 3]) * step[n, i])
-                colour += left * alpha * values[n, i, :3]
-                left *= 1 - alpha
-            total += float(((colour - target[n]) ** 2).sum())
-        return total / 9
-
-    found, gradient = composite_gradient(field, step, target)
-    assert found == pytest.approx(error(field), rel=1e-5)
-    for index in np.ndindex(field.shape):
-        up, down = field.copy(), field.copy()
-        up[index] += 1e-5
-        down[index] -= 1e-5
-        assert gradient[index] == pytest.approx((error(up) - error(down)) / 2e-5, abs=1e-5)
-    assert density(np.array([0.0, 100.0], np.float32)).tolist() == pytest.approx([1, math.exp(6)])
+def test_samples_are_composited_by_what_is_left_of_the_light():
+    field = torch.tensor([[[0.2, 0.0, 0.4, 0.0], [0.1, 0.1, 0.1, 9.0]]])
+    colour, weight = composite(field, torch.tensor([[math.log(2.0), 1e3]]))
+    assert weight[0].tolist() == pytest.approx([0.5, 0.5])  # a density of 1 over ln 2 m keeps half of the light
+    assert colour[0].tolist() == pytest.approx([0.15, 0.05, 0.25])
 
 
 def test_colours_alone_are_learnt_but_not_where_they_are():
