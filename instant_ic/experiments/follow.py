@@ -107,8 +107,8 @@ class FollowDrive:
     def __init__(self, seed: int, index: int) -> None:
         self.rng = np.random.default_rng([seed, index])
         self.room = worlds.make_room(self.rng, hidden=index % 3 == 0)
-        self.mask = worlds.filled(self.room.shapes, self.room.size, 0.01, worlds.IN_THE_WAY_M)
-        coarse = worlds.filled(self.room.shapes, self.room.size, 0.025, worlds.IN_THE_WAY_M)
+        self.mask = self.room.world.occupied(*worlds.IN_THE_WAY_M, 0.01)
+        coarse = self.room.world.occupied(*worlds.IN_THE_WAY_M, 0.025)
         goal = np.array([*self.room.goal, 0.0])
         self.optimum = worlds.shortest_way(coarse, self.room.start, goal, SPARE_M)
         self.episode = Episode(index, self.optimum is not None)
@@ -142,9 +142,8 @@ class FollowDrive:
 
     def _map(self) -> StaticMap:
         """Return the map that SLAM would build of the empty room: walls, free inside, unknown outside."""
-        walls = worlds.filled(
-            self.room.shapes[self.room.kinds == worlds.WALL], self.room.size, 0.05, worlds.IN_THE_WAY_M
-        )
+        only_walls = worlds.made(self.room.shapes[self.room.kinds == worlds.WALL], self.room.size)
+        walls = only_walls.occupied(*worlds.IN_THE_WAY_M, 0.05)
         occupancy = np.full(walls.cells.shape, -1, dtype=np.int8)
         centres = [walls.origin[i] + (np.arange(walls.cells.shape[1 - i]) + 0.5) * 0.05 for i in (0, 1)]
         inside = [(c > 0) & (c < s) for c, s in zip(centres, self.room.size, strict=True)]
@@ -234,7 +233,7 @@ class FollowDrive:
         return (0.0 if abs(bearing) > 0.6 else OPERATOR_M_S), min(max(1.5 * bearing, -0.8), 0.8)
 
     def _see(self, estimate: FloatArray, time_s: float, publish: bool) -> None:
-        points = worlds.look(self.room.shapes, self.robot.pose, self.rng)
+        points = worlds.look(self.room.world, self.robot.pose, self.rng)
         ranges = worlds.flat_ranges(points)
         beam = 2 * math.pi / worlds.BEAMS
         scan = (ranges, -math.pi + beam / 2, beam, worlds.RANGE_MIN_M, worlds.RANGE_MAX_M)

@@ -1,7 +1,7 @@
 """Rooms for ``ic evaluate follow``: walls with doors, boxes, low and hanging objects; and a simulated LiDAR.
 
-LiDAR and shortest path of the true footprint are computed from the shapes themselves and share no code with the code
-under evaluation.
+The LiDAR is cast in the simulator's world, and the shortest path of the true footprint is searched here; neither shares
+code with the code under evaluation.
 """
 
 from __future__ import annotations
@@ -15,7 +15,9 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from instant_ic.geometry.poses import pose_matrix
 from instant_ic.sim.contact import OccupancyMask
+from instant_ic.sim.world import Material, World, WorldBuilder
 
 FloatArray = NDArray[np.float64]
 
@@ -47,6 +49,7 @@ class Room:
         start: (3,) pose of the r-bot.
         goal: (2,) goal of the v-bot.
         route: (M, 2) the v-bot's path to the goal: around walls, through everything else.
+        world: the shapes on their floor.
     """
 
     size: FloatArray
@@ -55,28 +58,16 @@ class Room:
     start: FloatArray
     goal: FloatArray
     route: FloatArray
+    world: World
 
 
-def filled(shapes: FloatArray, size: FloatArray, cell_m: float, band: tuple[float, float]) -> OccupancyMask:
-    """Return the cells whose centre lies in a shape that overlaps the height range ``band``."""
-    margin = 0.5
-    columns, rows = np.ceil((size + 2 * margin) / cell_m).astype(int)
-    x = -margin + (np.arange(columns) + 0.5) * cell_m
-    y = -margin + (np.arange(rows) + 0.5) * cell_m
-    cells = np.zeros((rows, columns), dtype=bool)
-    for cx, cy, half_x, half_y, yaw, low, high in shapes:
-        if high < band[0] or low > band[1]:
-            continue
-        reach = math.hypot(half_x, half_y)
-        r = np.flatnonzero(np.abs(y - cy) <= reach + cell_m)
-        c = np.flatnonzero(np.abs(x - cx) <= reach + cell_m)
-        if r.size == 0 or c.size == 0:
-            continue
-        dx, dy = np.meshgrid(x[c] - cx, y[r] - cy)
-        cos, sin = math.cos(yaw), math.sin(yaw)
-        inside = (np.abs(cos * dx + sin * dy) <= half_x) & (np.abs(cos * dy - sin * dx) <= half_y)
-        cells[r[0] : r[-1] + 1, c[0] : c[-1] + 1] |= inside
-    return OccupancyMask(cells, np.array([-margin, -margin]), cell_m)
+def made(shapes: FloatArray, size: FloatArray) -> World:
+    """Return the world of shapes (N, 7), see ``Room``, on a floor of ``size``."""
+    builder = WorldBuilder()
+    builder.panel((0.0, size[1], 0.0), (size[0], 0.0, 0.0), (0.0, -size[1], 0.0), Material("white"))
+    for x, y, half_x, half_y, yaw, low, high in shapes:
+        builder.box((x, y), (2 * half_x, 2 * half_y, high - low), low, yaw)
+    return builder.build("room", 5.0, (0.0, 0.0, 0.0))
 
 
 def make_room(rng: np.random.Generator, hidden: bool, attempts: int = 200) -> Room:
@@ -91,7 +82,7 @@ def make_room(rng: np.random.Generator, hidden: bool, attempts: int = 200) -> Ro
         size = np.array([rng.uniform(8.0, 12.0), rng.uniform(7.0, 10.0)])
         shapes, kinds = _walls(rng, size)
         walls = np.array(shapes)
-        plan = filled(walls, size, 0.05, IN_THE_WAY_M)
+        plan = made(walls, size).occupied(*IN_THE_WAY_M, 0.05)
         for _ in range(int(rng.integers(6, 14))):
             kind = int(rng.choice([BOX, BOX, BOX, LOW, HANGING])) if hidden else BOX
             shapes.append(_thing(rng, size, kind))
@@ -114,7 +105,7 @@ def make_room(rng: np.random.Generator, hidden: bool, attempts: int = 200) -> Ro
         route = shortest_way(plan, start, np.array([*goal, 0.0]), 0.12)
         if route is None or _length(route) < 5.0:
             continue
-        return Room(size, every, kept, start, goal, route[:, :2])
+        return Room(size, every, kept, start, goal, route[:, :2], made(every, size))
     raise ValueError(f"no room with a path of 5 m found in {attempts} attempts")
 
 
@@ -174,20 +165,21 @@ def _length(path: FloatArray) -> float:
 # -- the LiDAR
 
 
-def look(shapes: FloatArray, pose: FloatArray, rng: np.random.Generator) -> FloatArray:
+def look(world: World, pose: FloatArray, rng: np.random.Generator) -> FloatArray:
     """Return the points (N, 3) of one revolution in the LiDAR's frame, with 1.5 cm of noise.
 
     z points up and x along the robot's heading.
     """
     angles = -math.pi + 2 * math.pi * (np.arange(AZIMUTHS) + 0.5) / AZIMUTHS
-    slopes = np.tan(np.radians(RINGS_DEG))
-    flat = _cast(shapes, float(pose[0]), float(pose[1]), float(pose[2]), angles, slopes)
-    slant = np.hypot(1.0, slopes)[None]
-    ranges = flat * slant
+    beam, ring = np.meshgrid(angles, np.radians(RINGS_DEG), indexing="ij")
+    directions = np.stack([np.cos(ring) * np.cos(beam), np.cos(ring) * np.sin(beam), np.sin(ring)], axis=-1)
+    lidar = pose_matrix(pose[0], pose[1], LIDAR_HEIGHT_M, yaw=pose[2])
+    rays = np.ascontiguousarray(directions.reshape(-1, 3) @ lidar[:3, :3].T, np.float32)
+    ranges, _ = world.caster.cast(lidar[:3, 3].astype(np.float32), rays)
+    ranges = ranges.reshape(beam.shape).astype(np.float64)
     seen = (ranges > RANGE_MIN_M) & (ranges < RANGE_MAX_M)
-    noisy = flat + np.where(seen, rng.normal(0.0, 0.015, flat.shape), 0.0) / slant
-    points = np.stack([noisy * np.cos(angles)[:, None], noisy * np.sin(angles)[:, None], noisy * slopes[None]], axis=-1)
-    return points[seen]
+    noisy = ranges + rng.normal(0.0, 0.015, ranges.shape)
+    return np.asarray(directions[seen] * noisy[seen][:, None])
 
 
 def flat_ranges(points: FloatArray) -> FloatArray:
@@ -199,46 +191,6 @@ def flat_ranges(points: FloatArray) -> FloatArray:
     np.minimum.at(ranges, beams, np.hypot(band[:, 0], band[:, 1]))
     ranges[ranges < RANGE_MIN_M] = -np.inf
     return ranges
-
-
-@njit(cache=True)
-def _cast(shapes, x, y, yaw, angles, slopes):  # type: ignore[no-untyped-def]
-    """Return the horizontal distance (A, R) to the first object along each azimuth and ring; inf for none."""
-    out = np.full((angles.shape[0], slopes.shape[0]), np.inf)
-    for a in range(angles.shape[0]):
-        dx, dy = math.cos(yaw + angles[a]), math.sin(yaw + angles[a])
-        for k in range(slopes.shape[0]):
-            if slopes[k] < 0.0:
-                out[a, k] = -LIDAR_HEIGHT_M / slopes[k]
-        for i in range(shapes.shape[0]):
-            cos, sin = math.cos(shapes[i, 4]), math.sin(shapes[i, 4])
-            px, py = x - shapes[i, 0], y - shapes[i, 1]
-            ox, oy = cos * px + sin * py, cos * py - sin * px
-            ex, ey = cos * dx + sin * dy, cos * dy - sin * dx
-            near, far = -np.inf, np.inf
-            for o, e, half in ((ox, ex, shapes[i, 2]), (oy, ey, shapes[i, 3])):
-                if abs(e) < 1e-12:
-                    if abs(o) > half:
-                        near = np.inf
-                else:
-                    t0, t1 = (-half - o) / e, (half - o) / e
-                    near, far = max(near, min(t0, t1)), min(far, max(t0, t1))
-            low, high = shapes[i, 5], shapes[i, 6]
-            if near > far or far < 0.0:
-                continue
-            near = max(near, 0.0)
-            for k in range(slopes.shape[0]):
-                z = LIDAR_HEIGHT_M + near * slopes[k]
-                hit = np.inf
-                if low <= z <= high:
-                    hit = near
-                elif z > high and slopes[k] < 0.0:
-                    hit = (high - LIDAR_HEIGHT_M) / slopes[k]
-                elif z < low and slopes[k] > 0.0:
-                    hit = (low - LIDAR_HEIGHT_M) / slopes[k]
-                if hit <= far and hit < out[a, k]:
-                    out[a, k] = hit
-    return out
 
 
 # -- the shortest way

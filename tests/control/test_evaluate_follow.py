@@ -18,9 +18,9 @@ from instant_ic.experiments.follow_worlds import Room
 
 def room(*shapes: tuple[float, ...]) -> Room:
     size = np.array([10.0, 8.0])
+    every, start, goal = np.array(shapes, float).reshape(-1, 7), np.array([2.0, 4.0, 0.0]), np.array([8.0, 4.0])
     kinds = np.ones(len(shapes), int)
-    start = np.array([2.0, 4.0, 0.0])
-    return Room(size, np.array(shapes, float).reshape(-1, 7), kinds, start, np.array([8.0, 4.0]), np.zeros((2, 2)))
+    return Room(size, every, kinds, start, goal, np.zeros((2, 2)), worlds.made(every, size))
 
 
 class Quiet:
@@ -42,7 +42,7 @@ class TestLidar:
         # A box 0.5 m high whose front is 3 m ahead; a wall behind it at 6 m, 2.5 m high.
         seen = ahead(
             worlds.look(
-                room((5.5, 4.0, 0.5, 1.0, 0.0, 0.0, 0.5), (8.05, 4.0, 0.05, 3.0, 0.0, 0.0, 2.5)).shapes,
+                room((5.5, 4.0, 0.5, 1.0, 0.0, 0.0, 0.5), (8.05, 4.0, 0.05, 3.0, 0.0, 0.0, 2.5)).world,
                 np.array([2.0, 4.0, 0.0]),
                 Quiet(),
             )
@@ -54,21 +54,21 @@ class TestLidar:
         assert reach[-3] == pytest.approx(3.0, abs=1e-3)  # 0.44 m high
         assert reach[-1] == pytest.approx(6.0, abs=1e-3)  # over it
         assert reach[15] == pytest.approx(6.0, abs=1e-3)  # 2.2 m: the wall still
-        top = ahead(worlds.look(room((5.5, 4.0, 0.5, 1.0, 0.0, 0.0, 0.4)).shapes, np.array([2.0, 4.0, 0.0]), Quiet()))  # type: ignore[arg-type]
+        top = ahead(worlds.look(room((5.5, 4.0, 0.5, 1.0, 0.0, 0.0, 0.4)).world, np.array([2.0, 4.0, 0.0]), Quiet()))  # type: ignore[arg-type]
         assert np.isclose(top[:, 0], 0.2 / math.tan(math.radians(3)), atol=1e-3).any()  # its top, 3.8 m off
 
     def test_a_hanging_bar_is_in_the_way_and_seen_from_afar_only(self) -> None:
         bar = (5.5, 4.0, 0.05, 1.0, 0.0, 0.9, 2.0)  # 0.3 m above the LiDAR: beams of 15° miss it within 1.1 m
-        assert worlds.filled(room(bar).shapes, np.array([10.0, 8.0]), 0.05, worlds.IN_THE_WAY_M).cells.any()
+        assert room(bar).world.occupied(*worlds.IN_THE_WAY_M, 0.05).cells.any()
         for x, seen in ((2.0, True), (4.8, False)):
-            points = ahead(worlds.look(room(bar).shapes, np.array([x, 4.0, 0.0]), Quiet()))  # type: ignore[arg-type]
+            points = ahead(worlds.look(room(bar).world, np.array([x, 4.0, 0.0]), Quiet()))  # type: ignore[arg-type]
             assert (points[:, 2] > -worlds.LIDAR_HEIGHT_M + 0.01).any() == seen
 
 
 class TestShortestWay:
     @staticmethod
     def way(*shapes: tuple[float, ...], margin: float = 0.0) -> np.ndarray | None:
-        mask = worlds.filled(room(*shapes).shapes, np.array([10.0, 8.0]), 0.025, worlds.IN_THE_WAY_M)
+        mask = room(*shapes).world.occupied(*worlds.IN_THE_WAY_M, 0.025)
         return worlds.shortest_way(mask, np.array([2.0, 4.0, 0.0]), np.array([8.0, 4.0, 0.0]), margin)
 
     def test_through_a_door_that_the_body_fits_and_no_other(self) -> None:

@@ -29,7 +29,7 @@ ROOM = np.array(
 def seen(pose: np.ndarray, person: np.ndarray | None, rng: np.random.Generator) -> SortedPoints:
     """A sweep in the room, with a box and a pole, placed in the room's frame."""
     people = [] if person is None else [(*person, 0.2, 0.2, 0.0, 0.0, 1.7)]
-    points = worlds.look(np.array([*ROOM, *people]), pose, rng).astype(np.float32)
+    points = worlds.look(worlds.made(np.array([*ROOM, *people]), np.array([10.0, 8.0])), pose, rng).astype(np.float32)
     level = matrix_from_pose2(pose)
     level[2, 3] = worlds.LIDAR_HEIGHT_M
     return sort_points(points, np.zeros(len(points), np.float32), level[None], 0.0, HeightConfig())
