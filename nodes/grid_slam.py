@@ -10,7 +10,6 @@ from instant_ic.adapters import slam as slam_messages
 from instant_ic.bus import LATCHED, RELIABLE, SENSOR, WARN, Node, NodeError, QoS, main
 from instant_ic.geometry.transforms import TransformBuffer
 from instant_ic.slam.config import GridSlamConfig
-from instant_ic.slam.map_updates import MapUpdates
 from instant_ic.slam.odometry import CorrectionLimiter
 from instant_ic.slam.report import diagnoses
 from instant_ic.slam.scan import FloatArray
@@ -33,7 +32,6 @@ class GridSlamNode(Node[GridSlamConfig]):
         self.queue = ScanQueue(self.config)
         self.limiter = CorrectionLimiter()
         self.map_out = self.publisher("/map", msg.OccupancyGrid, qos=LATCHED)
-        self.update_out = self.publisher("/map_updates", msg.OccupancyGridUpdate, qos=RELIABLE)
         self.saved_out = self.publisher("/slam/saved", msg.String, qos=RELIABLE)
         self.pose_out = self.publisher("/pose", msg.PoseWithCovarianceStamped, qos=SENSOR)
         self.integrity_out = self.publisher("/slam/integrity", msg.PoseIntegrity, qos=SENSOR)
@@ -62,7 +60,7 @@ class GridSlamNode(Node[GridSlamConfig]):
             self.slam = make_slam(config, config.saved_map, config.mode == "localization")
         except ValueError as error:  # MapError is one
             raise NodeError(str(error)) from None
-        self.updates = MapUpdates(config.map_full_period_s)
+        self.published_version = 0
         self.placed_ns: int | None = None
         self.queue.restart()
         self.limiter.reset()
@@ -108,7 +106,7 @@ class GridSlamNode(Node[GridSlamConfig]):
             self.transforms.broadcast(parent, child, matrix, stamp)
         if slam.in_map_frame:
             self.pose_out.publish(slam_messages.pose_message(result, stamp))
-            if self.updates.grid is None:
+            if self.published_version == 0:
                 self.publish_map()
         job = slam.background_job()
         if job is not None:
@@ -135,15 +133,10 @@ class GridSlamNode(Node[GridSlamConfig]):
         self.saved_out.publish(msg.String(data=answer))
 
     def publish_map(self) -> None:
-        """Publish a changed map: in parts on /map_updates, whole at most every ``map_full_period_s``."""
-        if self.placed_ns is None:
-            return
-        steady_ns = self.clock.steady_ns()
-        update, grid = slam_messages.map_messages(self.updates, self.slam, self.placed_ns, steady_ns)
-        if update is not None:
-            self.update_out.publish(update)
-        if grid is not None:
-            self.map_out.publish(grid)
+        """Publish the map if it has changed."""
+        if self.placed_ns is not None and self.slam.map_version != self.published_version:
+            self.published_version = self.slam.map_version
+            self.map_out.publish(slam_messages.map_message(self.slam, self.placed_ns))
 
 
 if __name__ == "__main__":

@@ -12,7 +12,6 @@ from instant_ic.geometry.poses import Matrix, matrix_from_pose2, planar_covarian
 from instant_ic.geometry.transforms import TransformBuffer, TransformError
 from instant_ic.msg import (
     LaserScan,
-    OccupancyGridUpdate,
     PoseIntegrity,
     PoseWithCovariance,
     PoseWithCovarianceStamped,
@@ -28,7 +27,6 @@ from instant_ic.slam import GridSlam, Scan
 from instant_ic.slam.grid_slam import SlamResult
 from instant_ic.slam.localization import FoundPlace
 from instant_ic.slam.loop_closure import LoopOutcome
-from instant_ic.slam.map_updates import MapUpdates
 from instant_ic.slam.odometry import CorrectionLimiter
 from instant_ic.slam.scan import FloatArray
 from instant_ic.slam.scan_queue import ScanError, level_mount
@@ -92,18 +90,10 @@ def read_initial_pose(message: PoseWithCovarianceStamped) -> FloatArray:
     return pose2_from_message(message)
 
 
-def map_messages(updates: MapUpdates, slam: GridSlam, stamp: int, steady_ns: int) -> tuple[Any, Any]:
-    """Return the changed part (OccupancyGridUpdate) and the whole map (OccupancyGrid); None for what is not due."""
-    part, whole = updates.update(slam.map_version, slam.grid, steady_ns)
-    update = grid = None
-    if part is not None:
-        (height, width), data = part.values.shape, np.ascontiguousarray(part.values).reshape(-1)
-        place = {"x": part.x, "y": part.y, "width": width, "height": height}
-        update = OccupancyGridUpdate(header=header("map", stamp), data=data, **place)
-    if whole is not None:
-        origin = (float(whole.origin[0]), float(whole.origin[1]))
-        grid = grid_message(whole.values, whole.resolution, origin, "map", stamp)
-    return update, grid
+def map_message(slam: GridSlam, stamp: int) -> Any:
+    """Return the map as an OccupancyGrid."""
+    values, resolution, origin = slam.grid()
+    return grid_message(values, resolution, (float(origin[0]), float(origin[1])), "map", stamp)
 
 
 def save_answer(slam: GridSlam, stem: Path) -> str:

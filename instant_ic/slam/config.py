@@ -93,14 +93,12 @@ class GridSlamConfig(SlamConfig, QueueConfig):
     Attributes:
         mode: mapping: make a map, or extend map_file; localization: only localise in map_file.
         map_file: saved map, NAME or NAME.yaml ("ic map save NAME"); empty: start a new map.
-        map_period_s: minimum period of /map_updates, which holds the changed part of the map.
-        map_full_period_s: minimum period of /map (whole map); raise it for slow links with /map_updates.
+        map_period_s: minimum period of /map; raise it for slow links.
     """
 
     mode: Literal["mapping", "localization"] = "mapping"
     map_file: str = ""
     map_period_s: Positive = 1.0
-    map_full_period_s: Positive = 1.0
 
     def __post_init__(self) -> None:
         super().__post_init__()
