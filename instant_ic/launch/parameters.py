@@ -9,11 +9,25 @@ import functools
 import itertools
 import multiprocessing
 import signal
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
+from instant_ic.config.parameter_info import parameter_infos, plain
+from instant_ic.config.params import (
+    PROCESS_KEYS,
+    SHARED,
+    ParameterError,
+    Values,
+    configure,
+    flatten,
+    gather,
+    load_sections,
+    to_dict,
+    typed_value,
+)
+from instant_ic.config.yaml_text import one_line
 from instant_ic.launch.description import NodeSpec
 from instant_ic.launch.robot_parameters import RELATED, Driving, disagreements
 from instant_ic.util import paths
@@ -21,22 +35,12 @@ from instant_ic.util import paths
 if TYPE_CHECKING:
     from multiprocessing.connection import Connection
 
-    from instant_ic.config.params import Values
-
 CHECK_TIMEOUT_S = 120.0
 """Longest time that the check may take."""
 
 
 class ParameterCheckError(RuntimeError):
     """The check itself did not finish; the message says why."""
-
-
-class SharedValue(NamedTuple):
-    """A value that a ``/**`` section sets for all nodes of a run directory: as YAML, its place, its file."""
-
-    text: str
-    place: str
-    file: str
 
 
 def given_values(spec: NodeSpec) -> tuple[type[Any], Values]:
@@ -49,7 +53,6 @@ def given_values(spec: NodeSpec) -> tuple[type[Any], Values]:
     """
     from instant_ic.bus.node_files import node_class
     from instant_ic.bus.process import argument_parser, parse_remaps
-    from instant_ic.config.params import gather
 
     found = node_class(spec.exec)
     args = argument_parser(found).parse_args(_words(spec))
@@ -137,28 +140,23 @@ def _words(spec: NodeSpec) -> tuple[str, ...]:
     return spec.command[spec.command.index(str(paths.node_file(spec.exec))) + 1 :]
 
 
-def _shared(specs: Sequence[NodeSpec]) -> dict[str, dict[str, SharedValue]]:
+def _shared(specs: Sequence[NodeSpec]) -> dict[str, Values]:
     """Return the ``/**`` values of each run directory; the first node with a value decides."""
-    from instant_ic.config.params import PROCESS_KEYS, SHARED, ParameterError, load_sections
-    from instant_ic.config.yaml_text import one_line
-
     sections = functools.cache(load_sections)
-    found: dict[str, dict[str, SharedValue]] = {}
+    found: dict[str, Values] = {}
     for spec in specs:
-        own: dict[str, SharedValue] = {}
-        for file in [Path(word) for option, word in itertools.pairwise(_words(spec)) if option == "--params-file"]:
-            with suppress(ParameterError):  # the check of the node reports it
-                for key, value in sections(file).get(SHARED, {}).items():
-                    own[key] = SharedValue(one_line(value.given), value.where, str(file))
-        values = found.setdefault(spec.group, {})
-        values.update({key: value for key, value in own.items() if key not in values and key not in PROCESS_KEYS})
+        own: Values = {}
+        for option, word in itertools.pairwise(_words(spec)):
+            if option == "--params-file":
+                with suppress(ParameterError):  # the check of the node reports it
+                    own |= sections(Path(word)).get(SHARED, {})
+        found[spec.group] = own | found.get(spec.group, {})
     return found
 
 
 def _configured(spec: NodeSpec) -> tuple[Any, Values, list[str]]:
     """Return a node's configuration (None if it is refused), its values, and the problems of its command line."""
     from instant_ic.bus.node_files import NodeFileError
-    from instant_ic.config.params import ParameterError, configure
 
     where = f"{spec.file}:{spec.line}: node {spec.label}"
     values: Values = {}
@@ -180,37 +178,32 @@ def _configured(spec: NodeSpec) -> tuple[Any, Values, list[str]]:
         return None, values, [f"{where}: cannot be loaded: {type(error).__name__}: {error}"]
 
 
-def _contradictions(spec: NodeSpec, shared: Mapping[str, SharedValue], values: Values, config: Any) -> Iterator[str]:
+def _contradictions(spec: NodeSpec, shared: Values, values: Values, config: Any) -> Iterator[str]:
     """Yield values that differ from the shared one, unless stated beside it or on the node's own entry."""
-    from instant_ic.config.parameter_info import plain
-    from instant_ic.config.params import flatten, to_dict, typed_value, yaml_value
-
     effective = flatten(to_dict(config))
     for key, wanted in shared.items():
         value = values.get(key)
-        if key not in effective:
+        if key not in effective:  # the process's own parameters too
             continue
         got = plain(effective[key])
         with suppress(ValueError):  # the node that takes it reports it
-            if got == plain(typed_value(type(config), key, yaml_value(wanted.text, wanted.place))):
+            if got == plain(typed_value(type(config), key, wanted.given)):
                 continue
         if value is None:
             yield (
-                f"{spec.file}:{spec.line}: node {spec.label}: {key} is {got}, its default, but {wanted.place} sets "
-                f"{wanted.text} for the other nodes: give it the same file (from: {wanted.file})"
+                f"{spec.file}:{spec.line}: node {spec.label}: {key} is {got}, its default, but {wanted.where} sets "
+                f"{one_line(wanted.given)} for the other nodes: give it the same file (from: {wanted.file})"
             )
-        elif value.file is not None and (value.shared or str(value.file) != wanted.file):
+        elif value.file is not None and (value.shared or value.file != wanted.file):
             yield (
-                f"{value.where}: {key} {got} contradicts {wanted.place}, which sets {wanted.text} for all nodes: "
-                f"change it there, or set it for this node in the launch file (node {spec.label})"
+                f"{value.where}: {key} {got} contradicts {wanted.where}, which sets {one_line(wanted.given)} for all "
+                f"nodes: change it there, or set it for this node in the launch file (node {spec.label})"
             )
 
 
 def _declared_by_none(spec: NodeSpec, values: Values) -> list[str]:
     """Return a node's shared values that no shipped node declares."""
     from instant_ic.bus.node_files import node_class
-    from instant_ic.config.parameter_info import parameter_infos
-    from instant_ic.config.params import PROCESS_KEYS
 
     left = {key: value for key, value in values.items() if value.shared and key not in PROCESS_KEYS}
     for name in (spec.exec, *paths.node_names()):
