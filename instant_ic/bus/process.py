@@ -129,7 +129,7 @@ def run(node_class: type[Node[Any]], argv: Sequence[str] | None = None) -> int:
     args = argument_parser(node_class).parse_args(argv)
     handler = logging.StreamHandler(sys.stderr)
     text = f"%(asctime)s.%(msecs)03d %(levelname)-7s {args.name}: %(message)s"
-    handler.setFormatter(SafeFormatter(text, datefmt="%H:%M:%S"))
+    handler.setFormatter(SafeFormatter(text, datefmt="%Y-%m-%d %H:%M:%S"))
     # Debug output of other packages would flood the node's own.
     logging.basicConfig(level=logging.INFO, handlers=[handler])
     log = logging.getLogger(args.name)

@@ -6,13 +6,12 @@ import os
 import re
 from collections.abc import Collection
 from dataclasses import dataclass
-from datetime import datetime, timedelta
 from pathlib import Path
 
 from instant_ic.util.safe_text import masked, visible
 
 LEVELS = ("DEBUG", "INFO", "WARNING", "ERROR", "CRITICAL")
-_LINE = re.compile(r"(\d\d):(\d\d):(\d\d)\.(\d{3}) (DEBUG|INFO|WARNING|ERROR|CRITICAL) +([^\s:]+): (.*)")
+_LINE = re.compile(r"(\d{4}-\d\d-\d\d \d\d:\d\d:\d\d\.\d{3}) (DEBUG|INFO|WARNING|ERROR|CRITICAL) +([^\s:]+): (.*)")
 _COLOURS = {"DEBUG": "2", "WARNING": "33", "ERROR": "31", "CRITICAL": "1;31"}
 
 
@@ -21,12 +20,12 @@ class LogLine:
     """One log entry; a traceback belongs to the entry before it.
 
     Attributes:
-        stamp_s: seconds since the epoch.
+        stamp: local date and time, ``2026-03-04 12:00:00.250``; empty if unknown.
         level: one of ``LEVELS``.
         text: the message; several lines for a traceback.
     """
 
-    stamp_s: float
+    stamp: str
     level: str
     node: str
     text: str
@@ -37,49 +36,31 @@ class LogLine:
 
     def show(self, colour: bool) -> str:
         """Return the entry for the terminal."""
-        stamp = datetime.fromtimestamp(self.stamp_s).strftime("%H:%M:%S.%f")[:-3]
         node, text = visible(self.node), visible(masked(self.text))
         if not colour:
-            return f"{stamp} {self.level:<7} {node}: {text}"
+            return f"{self.stamp} {self.level:<7} {node}: {text}"
         code = _COLOURS.get(self.level, "")
         start, end = (f"\x1b[{code}m", "\x1b[0m") if code else ("", "")
-        return f"\x1b[2m{stamp}\x1b[0m {start}{self.level:<7}{end} \x1b[1m{node}\x1b[0m: {start}{text}{end}"
+        return f"\x1b[2m{self.stamp}\x1b[0m {start}{self.level:<7}{end} \x1b[1m{node}\x1b[0m: {start}{text}{end}"
 
 
-def parse(text: str, node: str, end_s: float) -> list[LogLine]:
+def parse(text: str, node: str) -> list[LogLine]:
     """Return the entries of a node's log file.
-
-    The lines carry the time of day without a date. The last one was written just before ``end_s``. Where a line has a
-    later time of day than the next one, midnight lies between them.
 
     Args:
         text: content of the file.
-        node: owner of the file; a line in another format (output of a library) is attributed to it.
-        end_s: when the file was last written, seconds since the epoch.
+        node: owner of the file; lines before the first entry (output of a library) are attributed to it.
     """
     lines: list[LogLine] = []
     for raw in text.splitlines():
-        match = _LINE.match(raw)
-        if match:
-            hour, minute, second, ms = (int(part) for part in match.groups()[:4])
-            day_s = hour * 3600 + minute * 60 + second + ms / 1000
-            lines.append(LogLine(day_s, match[5], match[6], match[7]))
-        elif lines and lines[-1].level != "":
+        if match := _LINE.match(raw):
+            if lines and not lines[0].stamp:
+                lines[0].stamp = match[1]  # at the latest
+            lines.append(LogLine(*match.groups()))
+        elif lines:
             lines[-1].text += f"\n{raw}"
         else:
-            lines.append(LogLine(-1.0, "", node, raw))
-    later_s = None
-    day = datetime.fromtimestamp(end_s).replace(hour=0, minute=0, second=0, microsecond=0)
-    end_day_s = end_s - day.timestamp()
-    for line in reversed(lines):
-        if line.level == "":  # before the first line with a time
-            line.level, line.stamp_s = "INFO", end_s if later_s is None else later_s + day.timestamp()
-            continue
-        limit_s = end_day_s + 60.0 if later_s is None else later_s + 1.0  # threads may swap two lines
-        if line.stamp_s > limit_s:
-            day -= timedelta(days=1)
-        later_s = line.stamp_s
-        line.stamp_s += day.timestamp()
+            lines.append(LogLine("", "INFO", node, raw))
     return lines
 
 
@@ -107,7 +88,7 @@ class GrowingLog:
         # An incomplete line waits for its rest.
         whole, separator, rest = (self._partial + data).rpartition(b"\n")
         self._partial = rest
-        return parse((whole + separator).decode(errors="replace"), self._path.stem, status.st_mtime)
+        return parse((whole + separator).decode(errors="replace"), self._path.stem)
 
 
 class LogFolder:
@@ -129,4 +110,4 @@ class LogFolder:
             if not self._nodes or path.stem in self._nodes:
                 self._files.setdefault(path, GrowingLog(path))
         lines = [line for file in self._files.values() for line in file.new_lines()]
-        return sorted(lines, key=lambda line: line.stamp_s)
+        return sorted(lines, key=lambda line: line.stamp)

@@ -19,8 +19,8 @@ from instant_ic.util.safe_text import direct, masked, visible
 
 _COLOURS = ("cyan", "green", "magenta", "yellow", "blue", "bright_cyan", "bright_green", "bright_magenta")
 _LINE_STYLES = {" WARNING ": "yellow", " ERROR ": "red", " CRITICAL ": "bold red"}
-_LOGGED = re.compile(r"(?:\x1b\[[\d;]*m)*\d\d:\d\d:\d\d\.\d{3} ([A-Z]+) +(.*)")
-"""A line that a node logs: time, level, text."""
+_LOGGED = re.compile(r"\d{4}-\d\d-\d\d (\d\d:\d\d:\d\d\.\d{3} ([A-Z]+) +(.*))")
+"""A line that a node logs: date, time, level, text."""
 _HOLDS_BACK_S = 30.0
 """Warnings wait for "ready" for this long, since most of a start's end with it."""
 
@@ -105,8 +105,8 @@ class StackScreen:
         logged = _LOGGED.match(text)
         if logged is None:
             return self._shows.get(node, True)
-        key = node, re.sub(r"\d+", "0", logged[2])
-        new = logged[1] in ("WARNING", "ERROR", "CRITICAL") and key not in self._shown
+        key = node, re.sub(r"\d+", "0", logged[3])
+        new = logged[2] in ("WARNING", "ERROR", "CRITICAL") and key not in self._shown
         if new:
             self._shown.add(key)
             if self._starting:
@@ -121,7 +121,8 @@ class StackScreen:
     def _print_line(self, node: str, text: str) -> None:
         prefix = (f"{node:>{self._width}} │ ", self._colours.get(node, "white"))
         style = next((style for word, style in _LINE_STYLES.items() if word in text), "")
-        shown = visible(masked(text), colours=True)
+        logged = _LOGGED.match(text)
+        shown = visible(masked(logged[1] if logged else text), colours=True)
         self._console.print(Text.assemble(prefix, Text.from_ansi(shown, style=style)))
 
     def event(self, text: str, bad: bool = False) -> None:

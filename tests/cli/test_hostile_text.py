@@ -67,7 +67,7 @@ def test_a_log_line_shows_escapes_and_hides_passwords():
     text = SafeFormatter("%(message)s").format(record)
     assert RAW.findall(text) == [] and "secret" not in text and r"\x1b]0;owned" in text
     for colour in (False, True):
-        line = LogLine(0.0, "ERROR", f"n{EVIL}", f"{EVIL} rtsp://me:secret@h/").show(colour)
+        line = LogLine("", "ERROR", f"n{EVIL}", f"{EVIL} rtsp://me:secret@h/").show(colour)
         assert "secret" not in line
         assert RAW.findall(re.sub(r"\x1b\[[\d;]*m", "", line)) == []
 

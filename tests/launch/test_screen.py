@@ -72,25 +72,25 @@ def test_plain_lines_tell_a_degraded_topic_once_and_its_recovery(out: io.StringI
     ]
 
 
-WARNED = "12:00:00.000 WARNING slam: scan: 3 of 10 beams"
+WARNED = "2026-03-04 12:00:00.000 WARNING slam: scan: 3 of 10 beams"
 
 
 def test_a_nodes_warnings_are_shown_once_and_after_the_start_only(out: io.StringIO) -> None:
     with screen_on(out, live=False, period_s=60.0) as screen:
-        screen.node_line("slam", "12:00:00.000 INFO    slam: running")
-        screen.node_line("slam", "12:00:00.000 ERROR   slam: scan: none yet")
+        screen.node_line("slam", "2026-03-04 12:00:00.000 INFO    slam: running")
+        screen.node_line("slam", "2026-03-04 12:00:00.000 ERROR   slam: scan: none yet")
         screen.refresh(StackView((NodeRow("page", "degraded", "no camera"), NodeRow("slam", "running"))))
         screen.node_line("slam", WARNED)
         screen.node_line("slam", "  a line that belongs to it")
-        screen.node_line("slam", WARNED.replace("3", "4").replace("12:", "13:"))
+        screen.node_line("slam", WARNED.replace("3 of", "4 of").replace("12:", "13:"))
         screen.node_line("slam", "  a line that belongs to a line not shown")
-        screen.node_line("slam", "12:00:00.000 INFO    slam: running")
+        screen.node_line("slam", "2026-03-04 12:00:00.000 INFO    slam: running")
         screen.node_line("page", "Traceback (most recent call last):")
     lines = out.getvalue().splitlines()
     assert lines[1].startswith("launch │ ready after ")
     assert lines[2:] == [
         "launch │ page: no camera",
-        f"  slam │ {WARNED}",
+        f"  slam │ {WARNED[11:]}",
         "  slam │   a line that belongs to it",
         "  page │ Traceback (most recent call last):",
     ]
@@ -104,7 +104,7 @@ def test_warnings_of_a_start_that_does_not_end_are_shown(out: io.StringIO, monke
         later_s = time.monotonic() + 31.0
         monkeypatch.setattr(time, "monotonic", lambda: later_s)
         screen.refresh(StackView(missing=("page",)))
-    assert out.getvalue().splitlines()[0] == f"  slam │ {WARNED}"
+    assert out.getvalue().splitlines()[0] == f"  slam │ {WARNED[11:]}"
 
 
 def test_table_of_nodes(out: io.StringIO) -> None:
