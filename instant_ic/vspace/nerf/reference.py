@@ -1,10 +1,10 @@
-"""The field in plain torch: one training step and one rendered view, in the order in which they happen.
+"""The field in plain torch: the reference for the fast kernels, in the order of a training step and of a view.
 
-A training step is ``sample_rays`` → ``query`` → ``loss`` → ``adam_touched``, see ``train_step``. A view is ``trace`` →
+A training step is ``sample_rays`` → ``query`` → ``loss`` → ``adam_touched`` (``train_step``). A view is ``trace`` →
 ``query`` → ``mix_panorama``. The fast kernels have the same names (numba: ``march.py``, ``kernels.py``; Triton:
-``triton_kernels.py``), and tests compare them with these. It also runs on CUDA where Triton does not work.
+``triton_kernels.py``). Tests compare them with these functions.
 
-Differentiable: ``encode``, ``query`` and ``loss`` in table and network (not in the points). Nothing else is.
+``encode``, ``query`` and ``loss`` are differentiable in the table and the network, but not in the points.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ LOOKED_THROUGH = 3.0
 
 @dataclass
 class TorchField:
-    """A field's parameters, lattice and keyframes as tensors, in the shapes of the dataclasses of ``field``."""
+    """Parameters of a field, its lattice and its keyframes' cameras, in the shapes of ``field``'s dataclasses."""
 
     table: Tensor
     w1: Tensor
@@ -52,9 +52,13 @@ class TorchField:
 
 @dataclass
 class TorchPrior:
-    """A ``prior.PanoramaPrior`` as tensors; ``rgb`` float32 in 0..255, ``known``, ``depth_edge`` and ``usable`` bool.
+    """A ``prior.PanoramaPrior`` as tensors.
 
-    ``trust``: weight of each pixel's depth, (h, w); ``gain``: to the newest keyframe's exposure, (3,).
+    Attributes:
+        rgb: colours, 0 to 255, float32.
+        known, depth_edge, usable: bool.
+        trust: weight of each pixel's depth in the loss, (h, w).
+        gain: colour factors that bring the keyframe to the newest one's exposure, (3,).
     """
 
     rgb: Tensor
@@ -102,19 +106,19 @@ def train_step(
     rates: tuple[float, float],
     weights: tuple[Tensor, Tensor],
 ) -> tuple[float, float]:
-    """One training step with a signed distance as geometry; changes ``field`` and ``state``.
+    """Train a field with a signed distance as geometry for one step; update ``field`` and ``state`` in place.
 
     Args:
         field: parameters and lattice.
         priors: the keyframes, newest first.
         state: state of the optimiser.
         config: size of the batch and weights.
-        uniform: (N, 3) in [0, 1), one row a ray.
+        uniform: random numbers in [0, 1), one row per ray, (N, 3).
         rates: learning rates of table and network.
         weights: weights of the samples' colours and distances in the loss, (2 N,) each (``field.sample_weights``).
 
     Returns:
-        Mean squared colour error (0..1 units) and mean squared distance error (units of the band).
+        Mean squared colour error (0 to 1 units) and mean squared distance error (in bands).
     """
     state.steps += 1
     columns, rows = config.ray_columns, config.ray_rows
@@ -130,28 +134,30 @@ def train_step(
 
 @torch.no_grad()
 def adam_step(field: TorchField, state: TrainState, grads: tuple[Tensor, ...], rates: tuple[float, float]) -> None:
-    """One Adam step of table and network, in place."""
+    """Update table and network by one Adam step, in place."""
     for index, (value, grad) in enumerate(zip(field.parameters(), grads, strict=True)):
         step_size: float | Tensor = adam_step_size(rates[min(index, 1)], state.steps)
         if index == 0:
             step_size = step_size * state.level_rates
-        # A network's row is an entry like the table's: without a gradient it is left alone.
+        # A row of the network is treated like an entry of the table: without a gradient it stays.
         adam_touched(value, grad, *state.moments[index], step_size, BETA1, BETA2, EPSILON)
 
 
 def encode(table: Tensor, cells_per_m: Tensor, origin: Tensor, focus: Tensor, points: Tensor) -> Tensor:
-    """Trilinear hash-grid features.
+    """Interpolate the hash grid's features trilinearly.
+
+    A level counts less where its cells are narrower than a pixel of the keyframe that shows the point finest, and not
+    at all below half a pixel.
 
     Args:
-        table: (levels, size, features); size is a power of two.
-        cells_per_m: (levels,).
-        origin: (3,).
-        focus: places of the keyframes' cameras and radians of a panorama's pixel, (K, 4): levels whose cells are
-            narrower than a pixel of the keyframe that saw the place finest count less, from half a pixel on not at all.
-        points: (N, 3).
+        table: features of all entries, (levels, size, features); size is a power of two.
+        cells_per_m: cells per metre of each level, (levels,).
+        origin: corner of a cell in the map, (3,).
+        focus: position of each keyframe's camera in metres, and angle of a pixel of its panorama in radians, (K, 4).
+        points: points in the map in metres, (N, 3).
 
     Returns:
-        (N, levels · features).
+        Features of all levels, (N, levels · features).
     """
     levels, size, _ = table.shape
     pixel = ((points[:, None] - focus[:, :3]).norm(dim=2) * focus[:, 3]).amin(dim=1)
@@ -175,14 +181,14 @@ def encode(table: Tensor, cells_per_m: Tensor, origin: Tensor, focus: Tensor, po
 
 
 def query(field: TorchField, points: Tensor) -> Tensor:
-    """Colour minus 0.5 and signed distance, (N, 4)."""
+    """Return colour minus 0.5 and signed distance of points (N, 3), (N, 4)."""
     features = encode(field.table, field.cells_per_m, field.origin, field.focus, points)
     hidden = torch.relu(features @ field.w1.T + field.b1)
     return hidden @ field.w2.T + field.b2
 
 
 def loss(output: Tensor, target: Tensor, colour_weight: Tensor, distance_weight: Tensor) -> tuple[Tensor, Tensor]:
-    """Weighted squared colour error and weighted squared distance error; training minimises their sum."""
+    """Return the weighted squared errors of colour and distance; training minimises their sum."""
     colour = (colour_weight[:, None] * (output[:, :3] - target[:, :3]) ** 2).sum()
     distance = (distance_weight * (output[:, 3] - target[:, 3]) ** 2).sum()
     return colour, distance
@@ -198,9 +204,17 @@ def adam_touched(
     beta2: float,
     epsilon: float,
 ) -> None:
-    """One Adam step in place on the entries (last axis) with any gradient; the others keep value and moments.
+    """Update the entries (last axis) that have a gradient by one Adam step; the others keep value and moments.
 
-    ``step_size``: one for all, or a tensor that broadcasts to ``value``.
+    Args:
+        value: parameters, updated in place.
+        grad: their gradient, of the same shape.
+        m: first moments, updated in place.
+        v: second moments, updated in place.
+        step_size: step size; a number, or a tensor that broadcasts to ``value``.
+        beta1: decay of the first moments.
+        beta2: decay of the second moments.
+        epsilon: lower limit of the denominator.
     """
     touched = (grad != 0).any(dim=-1, keepdim=True)
     m.copy_(torch.where(touched, beta1 * m + (1 - beta1) * grad, m))
@@ -216,6 +230,7 @@ def _corners(u: Tensor, v: Tensor, width: int, height: int) -> tuple[Tensor, Ten
 
 
 def bilinear(image: Tensor, u: Tensor, v: Tensor) -> Tensor:
+    """Interpolate a panorama, (h, w) or (h, w, C), at index coordinates (N,)."""
     left, right, top, bottom, fu, fv = _corners(u, v, image.shape[1], image.shape[0])
     if image.ndim == 3:
         fu, fv = fu[:, None], fv[:, None]
@@ -225,7 +240,7 @@ def bilinear(image: Tensor, u: Tensor, v: Tensor) -> Tensor:
 
 
 def prior_inverse_depth(prior: TorchPrior, u: Tensor, v: Tensor) -> Tensor:
-    """Inverse depth at index coordinates (N,): bilinear on a surface, nearest at an edge."""
+    """Return the inverse depth at index coordinates (N,): bilinear on a surface, nearest pixel at a depth edge."""
     inverse = prior.inverse_depth
     left, right, top, bottom, fu, fv = _corners(u, v, inverse.shape[1], inverse.shape[0])
     nearest = inverse[torch.where(fv >= 0.5, bottom, top), torch.where(fu >= 0.5, right, left)]
@@ -235,7 +250,10 @@ def prior_inverse_depth(prior: TorchPrior, u: Tensor, v: Tensor) -> Tensor:
 def sample_rays(
     uniform: Tensor, columns: int, rows: int, priors: list[TorchPrior], sources: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Points (2 N, 3), targets (2 N, 4) and weights (2 N, 2) of one ray in each stratum; see ``march.sample_rays``."""
+    """Sample one ray per stratum; return points (2 N, 3), targets (2 N, 4) and weights (2 N, 2).
+
+    Args: as ``march.sample_rays``.
+    """
     points = torch.zeros(2 * columns * rows, 3, device=uniform.device)
     target = torch.zeros(2 * columns * rows, 4, device=uniform.device)
     weight = torch.zeros(2 * columns * rows, 2, device=uniform.device)
@@ -250,7 +268,7 @@ def sample_rays(
 def _sample_rays(
     uniform: Tensor, n: Tensor, columns: int, rows: int, prior: TorchPrior, newest: TorchPrior
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Return the rays of number ``n`` (N,) of a batch, all of one keyframe."""
+    """Sample the rays with the numbers ``n`` (N,) in the batch, all from one keyframe."""
     height, width = prior.rgb.shape[:2]
     h, w = prior.inverse_depth.shape
     tile, inside = n // 64, n % 64
@@ -287,7 +305,10 @@ def _sample_rays(
 
 
 def prior_agrees(prior: TorchPrior, points: Tensor) -> Tensor:
-    """0, 1 or 2 for points (N, 3) of the camera frame; see ``march.prior_agrees``."""
+    """Return whether points (N, 3) in the camera's frame lie on the keyframe's surface: 0, 1 or 2.
+
+    0: no; 1: yes, but its depth was filled there; 2: yes, and its depth is known there.
+    """
     inverse = prior.inverse_depth
     height, width = inverse.shape
     distance = points.norm(dim=1)
@@ -302,7 +323,7 @@ def prior_agrees(prior: TorchPrior, points: Tensor) -> Tensor:
 
 
 def prior_distance(prior: TorchPrior, points: Tensor) -> Tensor:
-    """Signed distance of points (N, 3) of the camera frame to the prior's surface, in bands; as in ``march``."""
+    """Return the signed distance of points (N, 3) in the camera's frame to the keyframe's surface, in bands, (N,)."""
     nearness = prior_inverse_depth(prior, *_pixels(points, prior.inverse_depth))
     return (1 - points.norm(dim=1) * nearness) / prior.band
 
@@ -312,7 +333,10 @@ def _camera_frame(prior: TorchPrior, points: Tensor) -> Tensor:
 
 
 def nearest_prior(priors: list[TorchPrior], points: Tensor) -> tuple[Tensor, Tensor]:
-    """Signed distance to the nearest keyframe's surface, and agreement, of map points (N, 3); see ``march``."""
+    """Return signed distance to the nearest keyframe's surface and agreement of points (N, 3) in the map, (N,) each.
+
+    A keyframe that sees known depth far behind a point has looked through it: older keyframes do not count there.
+    """
     seen_through = torch.zeros(points.shape[0], dtype=torch.bool, device=points.device)
     for k, prior in enumerate(priors):
         local = _camera_frame(prior, points)
@@ -331,7 +355,7 @@ def nearest_prior(priors: list[TorchPrior], points: Tensor) -> tuple[Tensor, Ten
 
 
 def _pixels(points: Tensor, image: Tensor) -> tuple[Tensor, Tensor]:
-    """Index coordinates (u, v) in an equirect image of points (N, 3) of its camera's frame."""
+    """Return the index coordinates (u, v) of points (N, 3) of the camera's frame in an equirect image, (N,) each."""
     height, width = image.shape[:2]
     x, y, z = points.unbind(1)
     u = (math.pi - torch.atan2(y, x)) * (width / (2 * math.pi)) - 0.5
@@ -349,7 +373,10 @@ def mix_panorama(
     share: float,
     colour: Tensor,
 ) -> None:
-    """Mixes the panorama's colour into ``colour`` (P, 3) in place; see ``march.mix_panorama``."""
+    """Mix the colour of the newest keyframe that shows each point into ``colour`` (P, 3), in place.
+
+    Args: as ``march.mix_panorama``.
+    """
     at = torch.nonzero((depth > 0) & (confidence > 0))[:, 0]
     for k, prior in enumerate(priors):
         points = _camera_frame(prior, origin + depth[at, None] * directions[at])
@@ -363,7 +390,10 @@ def mix_panorama(
 def trace(
     field: TorchField, grid: TorchGrid, priors: list[TorchPrior], share: float, origin: Tensor, directions: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Depth along each ray, 0 where it meets nothing, and confidence, both (N,); see ``march.trace``."""
+    """March rays to the surface; return depth along each ray, 0 where it meets nothing, and confidence, (N,) each.
+
+    Args: as ``march.trace``.
+    """
     count = directions.shape[0]
     depth = torch.zeros(count, device=directions.device)
     confidence = torch.zeros(count, device=directions.device)
@@ -413,7 +443,7 @@ def _grid_span(origin: Tensor, directions: Tensor, grid: TorchGrid) -> tuple[Ten
 
 
 def _next_occupied(origin: Tensor, directions: Tensor, t: Tensor, leave: Tensor, grid: TorchGrid) -> Tensor:
-    """First place from ``t`` on in an occupied cell, −1 past ``leave``, (N,)."""
+    """Return the first depth from ``t`` on that lies in an occupied cell, (N,); −1 beyond ``leave``."""
     t = t.clone()
     shape = grid.distance.shape
     limit = torch.tensor(shape, device=t.device) - 1

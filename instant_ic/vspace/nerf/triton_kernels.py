@@ -1,11 +1,11 @@
-"""The field's kernels for NVIDIA GPUs (Triton): training samples, gradient, Adam on touched entries, whole images.
+"""The field's kernels for NVIDIA GPUs (Triton): training samples, gradient, Adam on touched entries, and views.
 
-Each does what the torch functions of ``reference.py`` do, named in its docstring. Only ``triton_device`` imports this
-module. ``TRITON_INTERPRET=1`` runs all of it on the CPU, for the tests.
+Each kernel's docstring names the torch functions of ``reference.py`` that compute the same. Only ``triton_device``
+imports this module. With ``TRITON_INTERPRET=1`` it runs on the CPU, for the tests.
 
-Tables are float16 where they are read, with float32 masters; sums are float32. Entries get their gradients by atomics,
-so that two runs differ in the last bits. Sizes that follow from the configuration are compiled in; what changes from
-scene to scene and image to image is not, so that nothing is compiled after the start.
+Kernels read a float16 copy of the table; Adam updates the float32 master. Sums are float32. Gradients are added
+atomically, so two runs differ in the last bits. Sizes from the configuration are compile-time constants; sizes that
+change with scenes and views are arguments, so nothing is compiled after the start.
 """
 
 # mypy: disable-error-code="no-untyped-def"
@@ -16,7 +16,7 @@ from __future__ import annotations
 import triton
 import triton.language as tl
 
-_P1 = tl.constexpr(2654435761 - (1 << 32))  # the hash's factors as int32: products wrap, and the low bits are the same
+_P1 = tl.constexpr(2654435761 - (1 << 32))  # factors of the hash as int32: products wrap, the low bits stay equal
 _P2 = tl.constexpr(805459861)
 _PI = tl.constexpr(3.141592653589793)
 _NOT_SEEN = tl.constexpr(1e9)
@@ -26,10 +26,10 @@ _LOOKED_THROUGH = tl.constexpr(3.0)
 
 @triton.jit
 def _atan2(y, x):
-    """Angle of (x, y) in −π..π, within 1e−6: the library's is not there in the interpreter."""
+    """Return the angle of (x, y), −π to π, within 1e−6; Triton's interpreter has no ``atan2``."""
     ax, ay = tl.abs(x), tl.abs(y)
     ratio = tl.minimum(ax, ay) / tl.maximum(tl.maximum(ax, ay), 1e-20)
-    wide = ratio > 0.4142135624  # tan(π/8): the rest of the octant is turned by π/4
+    wide = ratio > 0.4142135624  # tan(π/8); larger ratios are rotated by −π/4
     a = tl.where(wide, (ratio - 1) / (ratio + 1), ratio)
     z = a * a
     # Least squares of atan(a) / a on Chebyshev nodes of z in 0..tan²(π/8); error 7e−9.
@@ -42,7 +42,7 @@ def _atan2(y, x):
 
 @triton.jit
 def _corner(ix, iy, iz, fx, fy, fz, size, corner: tl.constexpr):
-    """Entry within its level, and trilinear weight, of one of a cell's eight corners."""
+    """Return the entry in the level's table and the trilinear weight of one of a cell's eight corners."""
     bx: tl.constexpr = corner & 1
     by: tl.constexpr = (corner >> 1) & 1
     bz: tl.constexpr = corner >> 2
@@ -53,7 +53,7 @@ def _corner(ix, iy, iz, fx, fy, fz, size, corner: tl.constexpr):
 
 @triton.jit
 def _cells(cells_per_m, origin, focus, keyframes, px, py, pz, LEVELS: tl.constexpr, LP: tl.constexpr):
-    """Cells (B, LP) of points at each level, places in them, and how much each level counts there."""
+    """Return each level's cells of points, the positions in them (0 to 1), and its weights there, (B, LP) each."""
     level = tl.arange(0, LP)
     scale = tl.load(cells_per_m + level, mask=level < LEVELS, other=0.0)[None, :]
     pixel = px * 0 + 1e9
@@ -74,7 +74,7 @@ def _encode(
     table, size, cells_per_m, origin, focus, keyframes, px, py, pz, wanted,
     LEVELS: tl.constexpr, LP: tl.constexpr, F: tl.constexpr, B: tl.constexpr,
 ):  # fmt: skip
-    """Features (B, LP · F) of points; ``reference.encode``."""
+    """Return the features of points, (B, LP · F); ``reference.encode``."""
     ix, iy, iz, fx, fy, fz, share = _cells(cells_per_m, origin, focus, keyframes, px, py, pz, LEVELS, LP)
     first = tl.arange(0, LP)[None, :] * size
     feature = tl.arange(0, F)[None, None, :]
@@ -89,7 +89,7 @@ def _encode(
 
 @triton.jit
 def _first_layer(network, IN: tl.constexpr, HIDDEN: tl.constexpr, LP: tl.constexpr, F: tl.constexpr, HP: tl.constexpr):
-    """Weights (HP, LP · F) and biases (HP,) of the first layer, 0 where they are padded."""
+    """Load weights (HP, LP · F) and biases (HP,) of the first layer, padded with 0."""
     j, i = tl.arange(0, HP), tl.arange(0, LP * F)
     inside = (j[:, None] < HIDDEN) & (i[None, :] < IN)
     w1 = tl.load(network + j[:, None] * IN + i[None, :], mask=inside, other=0.0)
@@ -98,7 +98,7 @@ def _first_layer(network, IN: tl.constexpr, HIDDEN: tl.constexpr, LP: tl.constex
 
 @triton.jit
 def _output(network, h, channel: tl.constexpr, IN: tl.constexpr, HIDDEN: tl.constexpr, HP: tl.constexpr):
-    """One of the network's four outputs, (B,), and the weights (HP,) that made it."""
+    """Return one of the network's four outputs, (B,), and its weights, (HP,)."""
     j = tl.arange(0, HP)
     start: tl.constexpr = HIDDEN * IN + HIDDEN
     w = tl.load(network + start + channel * HIDDEN + j, mask=j < HIDDEN, other=0.0)
@@ -118,7 +118,7 @@ def _bilinear_corners(u, v, width, height):
 
 @triton.jit
 def _panorama_pixel(x, y, z, width, height):
-    """Index coordinates in an equirect image of points of its camera's frame."""
+    """Return the index coordinates of points in the camera's frame in an equirect image."""
     u = (_PI - _atan2(y, x)) * (width / (2 * _PI)) - 0.5
     v = (0.5 * _PI - _atan2(z, tl.sqrt(x * x + y * y))) * (height / _PI) - 0.5
     return u, v
@@ -126,7 +126,7 @@ def _panorama_pixel(x, y, z, width, height):
 
 @triton.jit
 def _panorama_colour(rgb, gain, k, u, v, width, height, wanted, channel: tl.constexpr):
-    """One colour (0..1) of keyframe ``k``'s panorama in the newest's exposure; bilinear."""
+    """Return a colour channel (0 to 1) of keyframe ``k``'s panorama, bilinear, in the newest one's exposure."""
     left, right, top, bottom, fu, fv = _bilinear_corners(u, v, width, height)
     start = rgb + k * height * width * 3 + channel
     a = tl.load(start + (top * width + left) * 3, mask=wanted, other=0).to(tl.float32)
@@ -139,7 +139,10 @@ def _panorama_colour(rgb, gain, k, u, v, width, height, wanted, channel: tl.cons
 
 @triton.jit
 def _inverse_depth(inverse, depth_edge, k, u, v, width, height, wanted):
-    """Inverse depth of keyframe ``k``: bilinear on a surface, nearest at an edge; and the four that it is made of."""
+    """Return keyframe ``k``'s inverse depth: bilinear on a surface, nearest pixel at a depth edge.
+
+    Returns also the four values around it, the mark of a depth edge, and the index of the nearest pixel.
+    """
     left, right, top, bottom, fu, fv = _bilinear_corners(u, v, width, height)
     start = k * height * width
     a = tl.load(inverse + start + top * width + left, mask=wanted, other=1.0)
@@ -155,8 +158,9 @@ def _inverse_depth(inverse, depth_edge, k, u, v, width, height, wanted):
 
 @triton.jit
 def _against(inverse, depth_edge, known, poses, band, k, px, py, pz, width, height, wanted):
-    """Map points against keyframe ``k``: signed distance in its bands, agreement (0, 1, 2), the band's metres there,
-    whether its depth is known there; ``reference.prior_distance`` and ``prior_agrees``.
+    """Compare map points with keyframe ``k``; ``reference.prior_distance`` and ``reference.prior_agrees``.
+
+    Returns signed distance in its bands, agreement (0, 1, 2), the band in metres, and a mark of known depth.
     """
     m = poses + 16 * k
     x = tl.load(m) * px + tl.load(m + 1) * py + tl.load(m + 2) * pz + tl.load(m + 3)
@@ -179,7 +183,7 @@ def _against(inverse, depth_edge, known, poses, band, k, px, py, pz, width, heig
 
 @triton.jit
 def _nearest_prior(inverse, depth_edge, known, poses, band, keyframes, px, py, pz, width, height, wanted):
-    """Signed distance to the nearest keyframe's surface, and agreement; ``reference.nearest_prior``."""
+    """Return signed distance to the nearest keyframe's surface and agreement; ``reference.nearest_prior``."""
     best, unit = px * 0 + _NOT_SEEN, px * 0 + 1
     agrees, through = (px * 0).to(tl.int32), px * 0 > 1
     for k in range(keyframes):
@@ -199,7 +203,7 @@ def sample_rays(
     uniform, sources, rgb, inverse, depth_edge, usable, trust, map_poses, band, gain,
     columns, rows, width, height, w, h, points, target, weight, B: tl.constexpr,
 ):  # fmt: skip
-    """One ray in each stratum, two samples a ray; ``reference.sample_rays``. One program a tile of 64 rays."""
+    """Sample one ray per stratum and two points per ray; ``reference.sample_rays``. One program per tile of 64 rays."""
     tile = tl.program_id(0)
     inside = tl.arange(0, B)
     n = tile * B + inside
@@ -235,7 +239,7 @@ def sample_rays(
         colour = _panorama_colour(rgb, gain, k, u, v, width, height, every, c) - 0.5
         tl.store(target + 4 * surface + c, colour)
         tl.store(target + 4 * near + c, colour)
-    # Distances are in the newest's bands.
+    # Distances are in bands of the newest keyframe.
     other = half * depth / (tl.load(band) * tl.maximum(tl.sqrt(away), 0.5 * depth))
     tl.store(target + 4 * surface + 3, depth * 0)
     tl.store(target + 4 * near + 3, -offset * tl.where(k > 0, other, 1.0))
@@ -258,7 +262,7 @@ def gradient(
 ):  # fmt: skip
     """Add the gradient of ``reference.loss`` of ``reference.query`` to ``table_grad`` and ``network_grad``.
 
-    ``sums`` (4,): adds weighted squared colour error, weighted squared distance error, and the two weights' sums.
+    Add the weighted squared errors of colour and distance, and the sums of their weights, to ``sums`` (4,).
     """
     IN: tl.constexpr = LEVELS * F
     n = tl.program_id(0) * B + tl.arange(0, B)
@@ -313,9 +317,9 @@ def gradient(
 def adam_table(
     table, half_table, table_grad, m, v, step_size, size, beta1, beta2, epsilon, F: tl.constexpr, B: tl.constexpr
 ):
-    """One Adam step on the entries with any gradient, whose gradient is cleared; ``reference.adam_touched``.
+    """Update the entries that have a gradient by one Adam step, and clear it; ``reference.adam_touched``.
 
-    ``half_table`` gets the new values as float16. A program has ``B`` entries of one level, by whole numbers.
+    Write the new values to ``half_table`` as float16 too. One program per ``B`` entries of one level.
     """
     entry = tl.program_id(0).to(tl.int64) * B + tl.arange(0, B)
     at = entry[:, None] * F + tl.arange(0, F)[None, :]
@@ -334,7 +338,7 @@ def adam_table(
 
 @triton.jit
 def adam_network(network, network_grad, m, v, step_size, beta1, beta2, epsilon, COUNT: tl.constexpr, B: tl.constexpr):
-    """One Adam step on all of the network, whose gradient is cleared. One program."""
+    """Update the whole network by one Adam step, and clear its gradient. One program."""
     at = tl.arange(0, B)
     inside = at < COUNT
     g = tl.load(network_grad + at, mask=inside, other=0.0)
@@ -349,7 +353,7 @@ def adam_network(network, network_grad, m, v, step_size, beta1, beta2, epsilon, 
 
 @triton.jit
 def _span(o, d, low, size, enter, leave):
-    """Narrows a ray's stay in the grid by one axis."""
+    """Clip the part of a ray inside the grid, from ``enter`` to ``leave``, along one axis."""
     safe = tl.where(tl.abs(d) < 1e-9, 1e-9, d)
     a, b = (low - o) / safe, (low + size - o) / safe
     return tl.maximum(enter, tl.minimum(a, b)), tl.minimum(leave, tl.maximum(a, b))
@@ -375,7 +379,7 @@ def _turned_ray(directions, turn, at, inside):
 
 @triton.jit
 def _skip_free(grid, ox, oy, oz, dx, dy, dz, gx, gy, gz, nx, ny, nz, cell, t, leave, active):
-    """Move active rays to their next occupied cell; those that leave the grid end."""
+    """Advance active rays to their next occupied cell; deactivate those that leave the grid."""
     seeking = active
     while tl.max(seeking.to(tl.int32), axis=0) > 0:
         seeking = seeking & (t < leave)
@@ -394,7 +398,7 @@ def _distance(
     LEVELS: tl.constexpr, LP: tl.constexpr, F: tl.constexpr,
     HIDDEN: tl.constexpr, HP: tl.constexpr, B: tl.constexpr,
 ):  # fmt: skip
-    """Signed distance of points: the keyframes' and the field's, mixed by ``depth_share``."""
+    """Return the signed distance of points: the keyframes' with weight ``depth_share``, else the field's."""
     value = px * 0
     if depth_share > 0:
         of_prior, _ = _nearest_prior(inverse, depth_edge, known, poses, band, keyframes, px, py, pz, w, h, active)
@@ -409,35 +413,17 @@ def _distance(
 
 @triton.jit
 def _channel(network, hidden, shown, c: tl.constexpr, IN: tl.constexpr, HIDDEN: tl.constexpr, HP: tl.constexpr):
-    """One colour channel of the field, 0..1, where ``shown``."""
+    """Return a colour channel of the field, 0 to 1; 0 where not ``shown``."""
     value, _ = _output(network, hidden, c, IN, HIDDEN, HP)
     return tl.where(shown, tl.minimum(tl.maximum(value + 0.5, 0.0), 1.0), 0.0)
 
 
 @triton.jit
 def _mix_panorama(
-    red,
-    green,
-    blue,
-    rgb,
-    gain,
-    inverse,
-    depth_edge,
-    known,
-    poses,
-    band,
-    keyframes,
-    px,
-    py,
-    pz,
-    width,
-    height,
-    w,
-    h,
-    waiting,
-    panorama_share,
-):
-    """Mix in the panorama's colour: of the newest keyframe that has seen a point."""
+    red, green, blue, rgb, gain, inverse, depth_edge, known, poses, band, keyframes, px, py, pz, width, height, w, h,
+    waiting, panorama_share,
+):  # fmt: skip
+    """Mix in the colour of the newest keyframe that shows each point; ``reference.mix_panorama``."""
     for k in range(keyframes):
         m = poses + 16 * k
         x0 = tl.load(m) * px + tl.load(m + 1) * py + tl.load(m + 2) * pz + tl.load(m + 3)
@@ -461,7 +447,7 @@ def _march(
     LEVELS: tl.constexpr, LP: tl.constexpr, F: tl.constexpr,
     HIDDEN: tl.constexpr, HP: tl.constexpr, B: tl.constexpr,
 ):  # fmt: skip
-    """March rays to the surface; depth and confidence as of ``reference.trace``."""
+    """March rays to the surface and return depth and confidence; ``reference.trace``."""
     near_band = tl.load(band)
     t, leave = _span(ox, dx, gx, nx * cell, dx * 0, dx * 0 + 1e9)
     t, leave = _span(oy, dy, gy, ny * cell, t, leave)
@@ -505,14 +491,18 @@ def render_rays(
     LEVELS: tl.constexpr, LP: tl.constexpr, F: tl.constexpr,
     HIDDEN: tl.constexpr, HP: tl.constexpr, B: tl.constexpr,
 ):  # fmt: skip
-    """Render an image: march to the surface, the field's colour there, the panorama's share; 8 × 8 pixels a program.
+    """Render a view: march to the surface, query the field's colour there, and mix in the panorama's.
 
-    ``reference.trace``, ``reference.query`` and ``reference.mix_panorama`` in one.
+    Combines ``reference.trace``, ``reference.query`` and ``reference.mix_panorama``. One program per 8 × 8 pixels.
 
     Args:
         camera: position of the newest keyframe's camera, (3,).
-        eye: position of the view, (3,); turn: map_from_view rotation (3, 3); directions: rays in it, (P, 3).
-        colour (P, 3), depth (P,), confidence (P,): out.
+        eye: position of the view, (3,).
+        turn: map_from_view rotation, (3, 3).
+        directions: unit rays in the view's frame, (P, 3).
+        colour: result, 0 to 1, (P, 3).
+        depth: result in metres along each ray, (P,); 0 where it meets nothing.
+        confidence: result, (P,).
     """
     IN: tl.constexpr = LEVELS * F
     lane = tl.arange(0, B)
