@@ -15,6 +15,7 @@ from instant_ic.calibration.mount import CalibrationError, CalibrationFrame
 from instant_ic.geometry.poses import Matrix, inverse, wrap_angle, yaw_of
 from instant_ic.geometry.transforms import TransformBuffer, TransformError
 from instant_ic.lidar.deskew import points_at
+from instant_ic.lidar.stream import PacketStream
 from instant_ic.msg import MessageError, cloud_array, deserialize, stamp_ns, transform_matrix
 from instant_ic.util.limits import decode_image
 
@@ -82,16 +83,18 @@ def read_recording(
         CalibrationError: the bag lacks images or revolutions, or none of them coincide in time.
     """
     with BagReader(path) as bag:
-        types = {topic.topic: topic.type_name for topic in bag.topics}
-        image_topic = _choose(path, types, (PICTURE,), image_topic, ("/camera/image/compressed",))
-        points_topic = _choose(path, types, (CLOUD, PACKETS), points_topic, ("/lidar/points", "/lidar/packets"))
-        transforms = _transforms(bag, types)
-        stamps, camera = _stamps(path, bag, image_topic)
+        image_topic = _choose(bag, (PICTURE,), image_topic, ("/camera/image/compressed",))
+        transforms = _transforms(bag)
+        stamps, camera = _stamps(bag, image_topic)
         moves = {_BASE, _ODOM} <= transforms.frames()
-        chosen, places = _places(stamps, transforms if moves else None, most_frames)
+
+        def odom_from(frame: str, stamp: int) -> Matrix:
+            return transforms.lookup(_ODOM, frame, stamp) if moves else np.eye(4)
+
+        chosen, places = _places(stamps, odom_from, most_frames)
         if not chosen:
             raise CalibrationError(f"{path}: odometry on /tf does not overlap in time with the {len(stamps)} images")
-        clouds = _nearest_clouds(path, bag, points_topic, types[points_topic], list(chosen))
+        clouds = _nearest_clouds(bag, points_topic, list(chosen))
         frames = []
         for message in bag.messages([image_topic]):
             picture = deserialize(message.payload, message.type_name)
@@ -99,7 +102,7 @@ def read_recording(
             if stamp in clouds:
                 rgb = _decoded(path, picture)
                 try:
-                    frames.append(_frame(rgb, clouds[stamp], stamp, chosen[stamp], transforms if moves else None))
+                    frames.append(_frame(rgb, clouds[stamp], stamp, chosen[stamp], odom_from))
                 except TransformError as error:
                     raise CalibrationError(f"{path}: no odometry at {stamp / 1e9:.3f} s: {error}") from None
     lidar = next(iter(clouds.values())).frame_id
@@ -113,21 +116,10 @@ def read_recording(
     )
 
 
-def _choose(path: Path, types: dict[str, str], kinds: tuple[str, ...], wanted: str, usual: tuple[str, ...]) -> str:
-    found = sorted(topic for topic, kind in types.items() if kind in kinds)
-    names = " or ".join(kind.rsplit("/", 1)[-1] for kind in kinds)
-    if wanted and wanted not in found:
-        raise CalibrationError(f"{path}: no topic {wanted} of type {names}; available: {', '.join(found) or 'none'}")
-    choice = wanted or next((topic for topic in usual if topic in found), "") or (found[0] if len(found) == 1 else "")
-    if not choice:
-        there = f"select one of {', '.join(found)}" if found else f"topics of the bag: {', '.join(types) or 'none'}"
-        raise CalibrationError(f"{path}: no {' or '.join(usual)} ({names}); {there}")
-    return choice
-
-
-def _transforms(bag: BagReader, types: dict[str, str]) -> TransformBuffer:
+def _transforms(bag: BagReader) -> TransformBuffer:
     buffer = TransformBuffer(cache_s=1e9)
-    for message in bag.messages([topic for topic in ("/tf_static", "/tf") if topic in types]):
+    recorded = {topic.topic for topic in bag.topics}
+    for message in bag.messages([topic for topic in ("/tf_static", "/tf") if topic in recorded]):
         for one in deserialize(message.payload, message.type_name).transforms:
             try:
                 buffer.set(
@@ -139,16 +131,44 @@ def _transforms(bag: BagReader, types: dict[str, str]) -> TransformBuffer:
     return buffer
 
 
-def _stamps(path: Path, bag: BagReader, topic: str) -> tuple[list[int], str]:
-    """Return the stamps of the images in rising order, and their frame id."""
-    stamps, frame = set(), ""
+def _clouds(bag: BagReader, points_topic: str, near: Callable[[int], bool]) -> Iterator[CalibrationCloud]:
+    """Yield the revolutions, from points or packets, for which ``near`` accepts the time (ns) of the message."""
+    topic = _choose(bag, (CLOUD, PACKETS), points_topic, ("/lidar/points", "/lidar/packets"))
+    stream = PacketStream()
     for message in bag.messages([topic]):
-        picture = deserialize(message.payload, message.type_name)
-        stamps.add(stamp_ns(picture))
-        frame = picture.header.frame_id
-    if not stamps:
-        raise CalibrationError(f"{path}: no image on {topic}")
-    return sorted(stamps), frame
+        if message.type_name == CLOUD:
+            if near(message.stamp_ns):
+                cloud = deserialize(message.payload, message.type_name)
+                yield CalibrationCloud(cloud_array(cloud), stamp_ns(cloud), cloud.header.frame_id)
+            continue
+        scan = deserialize(message.payload, message.type_name)
+        for packet in scan.packets:
+            revolution = stream.feed(bytes(packet.data), stamp_ns(packet))
+            if revolution is not None and revolution.complete and near(revolution.end_ns):
+                yield CalibrationCloud(revolution.points, revolution.stamp_ns, scan.header.frame_id)
+
+
+def _choose(bag: BagReader, kinds: tuple[str, ...], wanted: str, usual: tuple[str, ...]) -> str:
+    types = {topic.topic: topic.type_name for topic in bag.topics}
+    found = sorted(topic for topic, kind in types.items() if kind in kinds)
+    names = " or ".join(kind.rsplit("/", 1)[-1] for kind in kinds)
+    if wanted and wanted not in found:
+        raise CalibrationError(
+            f"{bag.path}: no topic {wanted} of type {names}; available: {', '.join(found) or 'none'}"
+        )
+    choice = wanted or next((topic for topic in usual if topic in found), "") or (found[0] if len(found) == 1 else "")
+    if not choice:
+        there = f"select one of {', '.join(found)}" if found else f"topics of the bag: {', '.join(types) or 'none'}"
+        raise CalibrationError(f"{bag.path}: no {' or '.join(usual)} ({names}); {there}")
+    return choice
+
+
+def _stamps(bag: BagReader, topic: str) -> tuple[list[int], str]:
+    """Return the stamps of the images in rising order, and their frame id."""
+    headers = [deserialize(message.payload, message.type_name).header for message in bag.messages([topic])]
+    if not headers:
+        raise CalibrationError(f"{bag.path}: no image on {topic}")
+    return sorted({stamp_ns(each) for each in headers}), headers[-1].frame_id
 
 
 def _known(transforms: TransformBuffer, target: str, source: str) -> Matrix | None:
@@ -158,7 +178,7 @@ def _known(transforms: TransformBuffer, target: str, source: str) -> Matrix | No
         return None
 
 
-def _places(stamps: list[int], transforms: TransformBuffer | None, most_frames: int) -> tuple[dict[int, int], int]:
+def _places(stamps: list[int], odom_from: Callable[[str, int], Matrix], most_frames: int) -> tuple[dict[int, int], int]:
     """Select images: stamp → number of its place; and the number of places.
 
     The drive is divided into sections, each of which ends when the robot has moved or turned enough. Each section
@@ -170,17 +190,11 @@ def _places(stamps: list[int], transforms: TransformBuffer | None, most_frames: 
     best: list[tuple[float, int]] = []  # speed and stamp of each section
     start: Matrix | None = None
     for stamp in stamps:
-        speed = 0.0
-        if transforms is not None:
-            try:
-                before, pose, after = (
-                    transforms.lookup(_ODOM, _BASE, stamp + shift) for shift in (-50_000_000, 0, 50_000_000)
-                )
-            except TransformError:
-                continue  # outside the odometry: cannot be compensated
-            speed = sum(_moved(before, after)) / 0.1
-        else:
-            pose = np.eye(4)
+        try:
+            before, pose, after = (odom_from(_BASE, stamp + shift) for shift in (-50_000_000, 0, 50_000_000))
+        except TransformError:
+            continue  # outside the odometry: cannot be compensated
+        speed = sum(_moved(before, after)) / 0.1
         near = [k for k, xyz in enumerate(centres) if np.linalg.norm(xyz - pose[:3, 3]) < _DISTANCE_M]
         if not near:
             centres.append(pose[:3, 3])
@@ -208,37 +222,16 @@ def _evenly(values: list[int], most: int) -> list[int]:
     return [values[round(k)] for k in np.linspace(0, len(values) - 1, most)] if most else []
 
 
-def _clouds(bag: BagReader, topic: str, kind: str, near: Callable[[int], bool]) -> Iterator[CalibrationCloud]:
-    """Return the revolutions from points or packets whose messages are close in time to an image."""
-    if kind == CLOUD:
-        for message in bag.messages([topic]):
-            if near(message.stamp_ns):
-                cloud = deserialize(message.payload, message.type_name)
-                yield CalibrationCloud(cloud_array(cloud), stamp_ns(cloud), cloud.header.frame_id)
-        return
-    from instant_ic.lidar.stream import PacketStream
-
-    stream = PacketStream()
-    for message in bag.messages([topic]):
-        scan = deserialize(message.payload, message.type_name)
-        for packet in scan.packets:
-            revolution = stream.feed(bytes(packet.data), stamp_ns(packet))
-            if revolution is not None and revolution.complete and near(revolution.end_ns):
-                yield CalibrationCloud(revolution.points, revolution.stamp_ns, scan.header.frame_id)
-
-
-def _nearest_clouds(
-    path: Path, bag: BagReader, topic: str, kind: str, stamps: list[int]
-) -> dict[int, CalibrationCloud]:
+def _nearest_clouds(bag: BagReader, topic: str, stamps: list[int]) -> dict[int, CalibrationCloud]:
     """Return the revolution nearest in time to each stamp, where one is near enough."""
     # The bag stamps messages on arrival, up to a second late on a busy machine.
     at = np.array(stamps)
     found: dict[int, CalibrationCloud] = {}
     count = 0
-    for cloud in _clouds(bag, topic, kind, lambda ns: bool((np.abs(at - ns) < 1_500_000_000).any())):
+    for cloud in _clouds(bag, topic, lambda ns: bool((np.abs(at - ns) < 1_500_000_000).any())):
         missing = [name for name in _FIELDS if name not in (cloud.points.dtype.names or ())]
         if missing:
-            raise CalibrationError(f"{path}: {topic}: the points lack the field {', '.join(missing)}")
+            raise CalibrationError(f"{bag.path}: the points lack the field {', '.join(missing)}")
         count += 1
         if len(cloud.points) == 0:
             continue
@@ -249,7 +242,7 @@ def _nearest_clouds(
                 found[stamp] = cloud
     if not found:
         raise CalibrationError(
-            f"{path}: {count} revolutions on {topic}, none within {_MOST_GAP_S} s of "
+            f"{bag.path}: {count} revolutions, none within {_MOST_GAP_S} s of "
             f"one of the {len(stamps)} selected images. Check that both clocks were synchronised."
         )
     return found
@@ -267,17 +260,15 @@ def _decoded(path: Path, picture: Any) -> NDArray[np.uint8]:
 
 
 def _frame(
-    rgb: NDArray[np.uint8], cloud: CalibrationCloud, stamp: int, place: int, transforms: TransformBuffer | None
+    rgb: NDArray[np.uint8], cloud: CalibrationCloud, stamp: int, place: int, odom_from: Callable[[str, int], Matrix]
 ) -> CalibrationFrame:
     """Build a frame of image and revolution, with the points moved to the LiDAR's pose at the time of the image."""
-    cloud_points = cloud.points
-    xyz = np.stack([cloud_points[name] for name in "xyz"], axis=1).astype(np.float64)
-    usable = np.isfinite(xyz).all(axis=1) & np.isfinite(cloud_points["time"])
+    points = cloud.points
+    xyz = np.stack([points[name] for name in "xyz"], axis=1).astype(np.float64)
+    usable = np.isfinite(xyz).all(axis=1) & np.isfinite(points["time"])
     usable &= np.linalg.norm(np.where(usable[:, None], xyz, 0), axis=1) > _NEAREST_M
-    xyz, kept = xyz[usable], cloud_points[usable]
-    if transforms is not None:
-        lidar_from_odom = inverse(transforms.lookup(_ODOM, cloud.frame_id, stamp))
-        xyz = points_at(
-            xyz, kept["time"], cloud.stamp_ns, lambda at: lidar_from_odom @ transforms.lookup(_ODOM, cloud.frame_id, at)
-        )
+    kept, lidar_from_odom = points[usable], inverse(odom_from(cloud.frame_id, stamp))
+    xyz = points_at(
+        xyz[usable], kept["time"], cloud.stamp_ns, lambda at: lidar_from_odom @ odom_from(cloud.frame_id, at)
+    )
     return CalibrationFrame(rgb, xyz, kept["intensity"].astype(np.float64), kept["ring"].astype(np.int64), place)
