@@ -14,6 +14,7 @@ from instant_ic.bus.topics import Subscription
 from instant_ic.console import ConsoleBackend, ConsoleError, ConsoleServer, FrameKind, Look
 from instant_ic.console.backend import PageServer
 from instant_ic.console.config import ConsoleConfig
+from instant_ic.console.display import Display
 from instant_ic.console.feed import PLAN_PERIOD_S, STATE_PERIOD_S, Inputs, PageFeed
 from instant_ic.console.recording import RecorderError, RecordingDesk
 from instant_ic.control.robot_lease import RELEASED
@@ -56,18 +57,16 @@ class ConsoleNode(Node[ConsoleConfig], ConsoleBackend):
         except ConsoleError as error:
             raise NodeError(str(error)) from error
         self.recording = RecordingDesk(self.ask_recorder, lambda status: self.server.publish("recording", status))
-        outputs = requests.publish, shown.publish
-        self.feed = feed = PageFeed(
-            config, self.page or self.server, self.tf, inputs, *outputs, self.clock, self.diagnose
-        )
+        display = Display(self.tf, self.clock, inputs.control, inputs.vbot, config.camera_mount)
+        self.feed = feed = PageFeed(self, self.page or self.server, display, inputs, requests.publish, shown.publish)
         self.subscribe("/camera/image/compressed", msg.CompressedImage, feed.take_panorama, qos=SENSOR)
         self.subscribe("/vspace/view", msg.RenderedView, feed.take_view, qos=SENSOR)
-        self.mesher = self.background(feed.layers_of, feed.take_layers)  # 30 ms: commands must not wait for it
-        self.layers: Subscription | None = None
-        self.subscribe("/map", msg.OccupancyGrid, lambda m: feed.grids.take(FrameKind.MAP, m), qos=LATCHED)
-        self.subscribe("/costmap", msg.OccupancyGrid, lambda m: feed.grids.take(FrameKind.COSTMAP, m), qos=SENSOR)
+        self.subscribe("/map", msg.OccupancyGrid, lambda m: feed.take_grid(FrameKind.MAP, m), qos=LATCHED)
+        self.subscribe("/costmap", msg.OccupancyGrid, lambda m: feed.take_grid(FrameKind.COSTMAP, m), qos=SENSOR)
         self.subscribe("/diagnostics", msg.DiagnosticArray, feed.faults.take_diagnoses, qos=RELIABLE)
         self.subscribe("/heartbeat", msg.NodeStatus, feed.faults.take_heartbeat, qos=RELIABLE)
+        self.mesher = self.background(feed.layers_of, feed.take_layers)  # 30 ms: commands must not wait for it
+        self.layers: Subscription | None = None
         self.timer(1.0, feed.send_health)
         self.page_timers: list[Timer] = []
         self.feed_page(self.run_dir is None)  # in lockstep there are no pages that could come

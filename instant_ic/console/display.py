@@ -1,4 +1,4 @@
-"""Mode, newest camera image and newest rendered view of the page."""
+"""State of the page's main image: mode, poses of both robots, newest camera image and newest rendered view."""
 
 from __future__ import annotations
 
@@ -7,27 +7,38 @@ import math
 import numpy as np
 
 from instant_ic.bus.clock import Clock
+from instant_ic.bus.topics import Latest
+from instant_ic.config.robot import Mount
 from instant_ic.console.protocol import FrameKind
-from instant_ic.console.robot_poses import RobotPoses
 from instant_ic.control.states import Mode
-from instant_ic.msg import ControlState, Pose, ShownPictures, header, pose_message, to_time
+from instant_ic.geometry.poses import Matrix
+from instant_ic.geometry.transforms import TransformBuffer, TransformError
+from instant_ic.msg import ControlState, Pose, ShownPictures, header, matrix_from_pose, pose_message, to_time
 from instant_ic.util.pace import current
 
 MODES = {int(mode): mode.label for mode in Mode}
 
 
 class Display:
-    """State of the page's main image, reported to the arbiter by :meth:`report`.
+    """State of the page's main image, reported to the arbiter by :meth:`report`. Poses are in the map frame.
+
+    Args:
+        tf: transform tree.
+        clock: time of the stamps, and a steady time.
+        mount: mount of the camera while the tree lacks it.
 
     Attributes:
+        control: newest ControlState.
+        vbot: newest odometry of the v-bot.
         mode: name of the control mode; ``none`` without an arbiter.
         shown: ``real`` (camera image), ``virtual`` (rendered view) or ``none``.
         image_stamp_ns: stamp of the newest camera image; 0 without one.
     """
 
-    def __init__(self, poses: RobotPoses, clock: Clock) -> None:
+    def __init__(self, tf: TransformBuffer, clock: Clock, control: Latest, vbot: Latest, mount: Mount) -> None:
         self.mode = self.shown = "none"
-        self._poses, self._clock = poses, clock
+        self.control, self.vbot = control, vbot
+        self._tf, self._clock, self._mount = tf, clock, mount
         self._image_ns: int | None = None  # arrival of the newest camera image, steady clock
         self.image_stamp_ns = 0
         self._view = (0, 0, 0.0)  # driver's newest view: request id, arrival (steady ns), delay (s)
@@ -52,9 +63,9 @@ class Display:
         """Return whether a new state of the arbiter changes the mode that the page shows."""
         return self.mode not in ("none", MODES.get(int(control.mode)))
 
-    def step(self, control: ControlState | None) -> None:
-        """Follow the arbiter's newest state; None: there is none."""
-        if control is None:
+    def step(self) -> None:
+        """Follow the arbiter's newest state."""
+        if (control := self.control.message) is None:
             self.mode = self.shown = "none"
         else:
             self.mode = MODES.get(int(control.mode), "none")
@@ -97,8 +108,8 @@ class Display:
         pose = self._view_pose
         if self._drawn_ms is not None:  # the page renders the v-bot's present pose, as of this state
             view_id, came_ns, delay_s = self._drawn_id, self._drawn_ns, 0.0
-            if (vbot := self._poses.vbot_pose()) is not None:
-                pose = pose_message(vbot @ self._poses.camera_mount())
+            if (vbot := self.vbot_pose()) is not None:
+                pose = pose_message(vbot @ self.camera_mount())
         return ShownPictures(
             header=header("map", stamp_ns),
             picture_stamp=to_time(self.image_stamp_ns),
@@ -110,3 +121,32 @@ class Display:
             # Steady clock: if the system clock is set back, new commands must not look older than the loss.
             operator_lost=to_time(0 if lost_ns is None else stamp_ns - (now_ns - lost_ns)),
         )
+
+    def lookup(self, target: str, source: str, stamp_ns: int | None = None) -> Matrix | None:
+        """Return ``target_from_source`` at ``stamp_ns``, else the newest one; None if the tree has a gap."""
+        for when in (stamp_ns, None):
+            try:
+                return self._tf.lookup(target, source, when)
+            except TransformError:
+                continue
+        return None
+
+    def robot_pose(self) -> Matrix | None:
+        """Return map_from_base of the r-bot; the arbiter's estimate if the tree has a gap."""
+        pose = self.lookup("map", "base_link")
+        control = self.control.message
+        return matrix_from_pose(control.robot_pose) if pose is None and control is not None else pose
+
+    def vbot_pose(self) -> Matrix | None:
+        """Return map_from_base of the v-bot; the arbiter's estimate until the v-bot publishes its own."""
+        if self.vbot.message is not None:
+            return matrix_from_pose(self.vbot.message)
+        control = self.control.message
+        return None if control is None else matrix_from_pose(control.vbot_pose)
+
+    def camera_mount(self) -> Matrix:
+        """Return base_from_camera with the identity as rotation: look directions are relative to the heading."""
+        mount = np.eye(4)
+        base_from_camera = self.lookup("base_link", "camera")
+        mount[:3, 3] = self._mount.xyz if base_from_camera is None else base_from_camera[:3, 3]
+        return mount

@@ -7,34 +7,21 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
+from instant_ic import msg
 from instant_ic.adapters.vspace import layers_of
-from instant_ic.bus.clock import Clock
+from instant_ic.bus import Node
 from instant_ic.bus.topics import Latest
 from instant_ic.console import page_messages as page
 from instant_ic.console.backend import PageServer
 from instant_ic.console.config import ConsoleConfig
 from instant_ic.console.display import Display
 from instant_ic.console.faults import ERROR, OK, WARN, FaultList
-from instant_ic.console.gridimage import GridLayers
+from instant_ic.console.gridimage import grid_image
 from instant_ic.console.layers import MOST_LAYERS, LayerMeshes, PageLayers
-from instant_ic.console.protocol import FrameKind, PageProtocolError
-from instant_ic.console.robot_poses import RobotPoses
+from instant_ic.console.protocol import FrameKind, PageProtocolError, PendingFrame
 from instant_ic.console.server import PLAIN_HTTP
 from instant_ic.console.view import ViewSchedule
-from instant_ic.geometry.transforms import TransformBuffer
-from instant_ic.msg import (
-    CompressedImage,
-    ControlState,
-    Odometry,
-    RenderedView,
-    ShownPictures,
-    ViewRequest,
-    VspaceLayers,
-    VspaceStatus,
-    header,
-    pose_message,
-    stamp_ns,
-)
+from instant_ic.msg import grid_array, header, pose_message, stamp_ns
 from instant_ic.util.pace import current
 
 IMAGE_TIMEOUT_S = 2.0
@@ -56,17 +43,15 @@ class Inputs:
 
 
 class PageFeed:
-    """Feed of the page's server with the stack's messages.
+    """Feed of the page's server with the messages of a node.
 
     Args:
-        config: parameters of the console.
-        server: receiver of the messages.
-        tf: transform tree.
+        node: node ``console``.
+        server: receiver of everything for the page.
+        display: state of the page's main image.
         inputs: newest messages.
         send_request: function that requests a rendered view.
         send_shown: function that reports the available images to the arbiter. Called on any thread.
-        clock: time of the stamps, and a steady time.
-        diagnose: function that sets a diagnosis: name, level, text, values.
 
     Attributes:
         watched: true while there is a page. Without one, no state is sent, no view is requested and no report goes to
@@ -75,38 +60,36 @@ class PageFeed:
 
     def __init__(
         self,
-        config: ConsoleConfig,
+        node: Node[ConsoleConfig],
         server: PageServer,
-        tf: TransformBuffer,
+        display: Display,
         inputs: Inputs,
-        send_request: Callable[[ViewRequest], None],
-        send_shown: Callable[[ShownPictures], None],
-        clock: Clock,
-        diagnose: Callable[..., None],
+        send_request: Callable[[msg.ViewRequest], None],
+        send_shown: Callable[[msg.ShownPictures], None],
     ) -> None:
         self.watched = True
         self.server = server
+        self.display = display
+        self.views = ViewSchedule(node.config.view)
+        self.faults = FaultList(node.clock)
+        self._inputs, self._send_request, self._send_shown = inputs, send_request, send_shown
+        self._clock, self._diagnose, self._mount = node.clock, node.diagnose, node.config.camera_mount.xyz
         self._meshes = LayerMeshes()
-        self._mount = config.camera_mount.xyz
-        self.poses = RobotPoses(tf, inputs.control, inputs.vbot, config.camera_mount)
-        self.display = Display(self.poses, clock)
-        self.views = ViewSchedule(config.view)
-        self.grids, self.faults = GridLayers(), FaultList(clock)
+        self._grids: dict[FrameKind, msg.OccupancyGrid] = {}  # not sent yet
+        self._sent_grids: dict[FrameKind, PendingFrame] = {}
         self._state_sent_ns = 0
-        self._inputs, self._clock, self._diagnose = inputs, clock, diagnose
-        self._send_request, self._send_shown = send_request, send_shown
 
     # ---- messages ----------------------------------------------------------------------------------
 
-    def take_panorama(self, message: CompressedImage) -> None:
+    def take_panorama(self, message: msg.CompressedImage) -> None:
         """Forward a panorama unchanged, with the camera's rotation at its stamp."""
         stamp = stamp_ns(message)
         self.display.take_image(stamp)
         self.report_shown()
-        fields = page.panorama_header(self._captured_ms(stamp), self.poses.lookup("map", "camera", stamp))
+        fields = page.panorama_header(self._captured_ms(stamp), self.display.lookup("map", "camera", stamp))
         self.server.send_frame(FrameKind.PANORAMA, fields, bytes(message.data))
 
-    def take_view(self, message: RenderedView) -> None:
+    def take_view(self, message: msg.RenderedView) -> None:
         """Forward a rendered view, then request the next one."""
         if not (0 < message.fov_rad < math.pi):
             self._diagnose(
@@ -122,7 +105,7 @@ class PageFeed:
             self.server.send_frame(FrameKind.VIEW, fields, bytes(message.image.data))
         self._request_view()
 
-    def layers_of(self, message: VspaceLayers) -> PageLayers | str:
+    def layers_of(self, message: msg.VspaceLayers) -> PageLayers | str:
         """Return the layers that pages render, or an error as text. For a worker thread."""
         try:
             layers = layers_of(message)
@@ -142,16 +125,20 @@ class PageFeed:
             return
         self._diagnose("layers", OK, "", version=layers.version, layers=len(layers.layers))
 
-    def take_control(self, message: ControlState) -> None:
+    def take_control(self, message: msg.ControlState) -> None:
         """Send a change of mode at once, because both robots keep moving; show who drives, and the emergency stop."""
         self.server.follow_robot(message.holder, bool(message.estop))
         if self.display.changes_mode(message):
             self.send_state()
 
-    def take_vbot(self, message: Odometry) -> None:
+    def take_vbot(self, message: msg.Odometry) -> None:
         """Send each step of the v-bot at once: the timer would add half a period on average."""
         if self.display.with_vbot:
             self.send_state()
+
+    def take_grid(self, kind: FrameKind, message: msg.OccupancyGrid) -> None:
+        """Keep the newest map or costmap until it is sent."""
+        self._grids[kind] = message
 
     def lose_driver(self) -> None:
         """Report a lost driver to the arbiter at once. Called on the server's thread."""
@@ -170,26 +157,25 @@ class PageFeed:
         if not self.watched:
             return
         self._state_sent_ns = self._clock.steady_ns()
-        control, vbot = self._inputs.control.message, self._inputs.vbot.message
-        self.display.step(control)
-        if control is None:
+        self.display.step()
+        if self.display.control.message is None:
             self.server.follow_robot(None)
         self.server.show(*self.display.foreground)
-        self.server.publish("state", page.state_message(self.server.now_ms(), self.display, self.poses, control, vbot))
+        self.server.publish("state", page.state_message(self.server.now_ms(), self.display))
         self.report_shown()
         self._request_view()
 
     def send_plan(self) -> None:
         """Send trajectory, path and subgoal."""
-        newest = (self._inputs.trajectory.message, self._inputs.path.message, self._inputs.subgoal.message)
-        self.server.publish("plan", page.plan_message(self.display, self.poses, *newest))
+        newest = self._inputs.trajectory.message, self._inputs.path.message, self._inputs.subgoal.message
+        self.server.publish("plan", page.plan_message(self.display.mode == "virtual", *newest))
 
     def send_health(self) -> None:
         """Send virtual space, battery, CPU of the nodes, and faults in the text of the node that found them."""
         age_s = self.display.image_age_s
         self._check("camera", age_s <= IMAGE_TIMEOUT_S, "no image from the camera", age_s=age_s)
-        self._check("controller", self._inputs.control.message is not None, "no state from the arbiter")
-        self._check("pose", self.poses.robot_pose() is not None, "the robot's pose is unknown")
+        self._check("controller", self.display.control.message is not None, "no state from the arbiter")
+        self._check("pose", self.display.robot_pose() is not None, "the robot's pose is unknown")
         faults = self.faults.worst()
         if self.server.plain_http:  # on the page only, not as a diagnosis: the node itself works
             faults.append({"level": "warn", "name": "network", "text": PLAIN_HTTP})
@@ -198,8 +184,12 @@ class PageFeed:
 
     def send_grids(self) -> None:
         """Send map and costmap if they have changed."""
-        for kind, image in self.grids.changed():
-            self.server.send_frame(kind, image.header, image.payload)
+        while self._grids:
+            kind, message = self._grids.popitem()
+            image = grid_image(*grid_array(message))
+            if image is not None and self._sent_grids.get(kind) != image:
+                self._sent_grids[kind] = image
+                self.server.send_frame(kind, image.header, image.payload)
 
     def report_shown(self, always: bool = False) -> None:
         """Report the available images and the loss of the driver. Any thread may call it."""
@@ -211,15 +201,15 @@ class PageFeed:
         """Request the view that is due: of the v-bot, or else of the robot if the virtual space can render."""
         virtual, needed, now_ns = self.display.with_vbot, self.server.needs_views(), self._clock.steady_ns()
         status = self._inputs.vspace.message
-        renders = status is not None and int(status.state) in (VspaceStatus.TRAINING, VspaceStatus.READY)
-        map_from_base = self.poses.vbot_pose() if virtual else self.poses.robot_pose()
+        renders = status is not None and int(status.state) in (msg.VspaceStatus.TRAINING, msg.VspaceStatus.READY)
+        map_from_base = self.display.vbot_pose() if virtual else self.display.robot_pose()
         if not self.watched or not (virtual or renders) or map_from_base is None:
             return
         if self.views.is_due(virtual and needed, now_ns):
             number, (fov_rad, width, height) = self.views.next(needed, now_ns)
-            pose = pose_message(map_from_base @ self.poses.camera_mount() @ self.views.look.rotation())
+            pose = pose_message(map_from_base @ self.display.camera_mount() @ self.views.look.rotation())
             head = header("map", self._clock.now_ns())
-            self._send_request(ViewRequest(head, number, pose, fov_rad, width, height))
+            self._send_request(msg.ViewRequest(head, number, pose, fov_rad, width, height))
 
     def _check(self, name: str, fine: bool, fault: str, **values: Any) -> None:
         self._diagnose(name, OK if fine else WARN, "" if fine else fault, **values)

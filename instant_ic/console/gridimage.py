@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from instant_ic.console.protocol import FrameKind, PendingFrame
-from instant_ic.msg import OccupancyGrid, grid_array
+from instant_ic.console.protocol import PendingFrame
 
 UNKNOWN = 255
 
@@ -42,24 +39,3 @@ def grid_image(grid: NDArray[np.int8], resolution: float, origin_xy: tuple[float
         "y": float(origin_xy[1] + row * resolution),
     }
     return PendingFrame(header, cv2.imencode(".png", grey, [cv2.IMWRITE_PNG_COMPRESSION, 3])[1].tobytes())
-
-
-class GridLayers:
-    """Newest map and costmap."""
-
-    def __init__(self) -> None:
-        self._newest: dict[FrameKind, OccupancyGrid] = {}
-        self._sent: dict[FrameKind, PendingFrame] = {}
-
-    def take(self, kind: FrameKind, message: OccupancyGrid) -> None:
-        """Store the newest grid of a kind."""
-        self._newest[kind] = message
-
-    def changed(self) -> Iterator[tuple[FrameKind, PendingFrame]]:
-        """Yield the grids that differ from the last ones yielded."""
-        while self._newest:
-            kind, message = self._newest.popitem()
-            image = grid_image(*grid_array(message))
-            if image is not None and self._sent.get(kind) != image:
-                self._sent[kind] = image
-                yield kind, image

@@ -5,19 +5,19 @@ from __future__ import annotations
 import math
 from typing import Any
 
+import numpy as np
+
 from instant_ic.console.display import Display
 from instant_ic.console.layers import pose_fields
-from instant_ic.console.robot_poses import RobotPoses, planar
-from instant_ic.geometry.poses import Matrix
+from instant_ic.geometry.poses import Matrix, pose2_from_matrix
 from instant_ic.msg import (
     BatteryState,
-    ControlState,
-    Odometry,
     Path,
     PoseStamped,
     RenderedView,
     VspaceStatus,
     matrix_from_pose,
+    path_array,
     twist_values,
 )
 
@@ -29,17 +29,16 @@ VSPACE_STATES: dict[int, str] = {
 }
 
 
-def state_message(
-    at_ms: float, display: Display, poses: RobotPoses, control: ControlState | None, vbot: Odometry | None
-) -> dict[str, Any]:
+def state_message(at_ms: float, display: Display) -> dict[str, Any]:
     """Return the ``state`` message: mode, poses and commands."""
+    control, vbot = display.control.message, display.vbot.message
     moving = vbot if display.shown == "virtual" and vbot is not None else control and control.robot_twist
     state: dict[str, Any] = {
         "at_ms": at_ms,
         "mode": display.mode,
         "shown": display.shown,
-        "robot": planar(poses.robot_pose()),
-        "vbot": planar(poses.vbot_pose()) if display.with_vbot else None,
+        "robot": planar(display.robot_pose()),
+        "vbot": planar(display.vbot_pose()) if display.with_vbot else None,
         "twist": [0.0, 0.0] if moving is None else [finite(value) or 0.0 for value in twist_values(moving)],
     }
     if control is None:
@@ -52,13 +51,12 @@ def state_message(
 
 
 def plan_message(
-    display: Display, poses: RobotPoses, trajectory: Path | None, path: Path | None, subgoal: PoseStamped | None
+    virtual: bool, trajectory: Path | None, path: Path | None, subgoal: PoseStamped | None
 ) -> dict[str, Any]:
-    """Return the ``plan`` message; path and subgoal belong to the virtual mode."""
-    virtual = display.mode == "virtual"
+    """Return the ``plan`` message; path and subgoal belong to the ``virtual`` mode."""
     return {
-        "trajectory": poses.points(trajectory),
-        "path": poses.points(path) if virtual else [],
+        "trajectory": points(trajectory),
+        "path": points(path) if virtual else [],
         "subgoal": planar(matrix_from_pose(subgoal)) if virtual and subgoal is not None else None,
     }
 
@@ -116,3 +114,17 @@ def finite(value: Any) -> float | None:
     """Return a number for JSON; None for infinity and NaN."""
     number = float(value)
     return number if math.isfinite(number) else None
+
+
+def planar(pose: Matrix | None) -> list[float] | None:
+    """Return [x, y, yaw] of a pose, m and rad; None without one."""
+    return None if pose is None else [round(float(value), 4) for value in pose2_from_matrix(pose)]
+
+
+def points(path: Path | None) -> list[list[float]]:
+    """Return the points [x, y] of a path in the map frame, rounded to 1 mm; empty without one in this frame."""
+    if path is None or not path.poses or path.header.frame_id not in ("", "map"):
+        return []
+    xy = path_array(path)[:, :2]
+    found: list[list[float]] = xy[np.isfinite(xy).all(axis=1)].round(3).tolist()
+    return found

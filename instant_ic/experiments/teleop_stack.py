@@ -261,7 +261,7 @@ class SimulatedStack:
         else:
             exposure_s, taken_from = self._exposed.popleft()
             stamp = START_NS + round(exposure_s * 1e9)
-            known = self.nodes["console"].feed.poses.lookup("map", "camera", stamp)
+            known = self.nodes["console"].feed.display.lookup("map", "camera", stamp)
             place = taken_from if known is None else self._in_world(pose2_from_matrix(known))
             shown = Shown(self.time_s, self.time_s, False, taken_from, place[:2], float(self.robot[2]))
         self.newest[virtual] = shown
