@@ -8,11 +8,13 @@ from typing import Any
 
 from instant_ic.bag import BagError
 from instant_ic.bag.choice import TopicChoice
-from instant_ic.bag.live_nodes import LiveTopics
 from instant_ic.bag.recorder import BagRecorderConfig, Recorder, TakeMessage
 from instant_ic.bus import RECORD, Node, NodeError, main
+from instant_ic.bus.registry import NodeInfo, TopicWatch, list_nodes
 from instant_ic.bus.transport import Received, Stats
 from instant_ic.msg import Bool, ControlState
+
+_NODES_S = 2.0  # period of the search for nodes, which costs more than that for topics
 
 
 class BagRecorderNode(Node[BagRecorderConfig]):
@@ -25,7 +27,8 @@ class BagRecorderNode(Node[BagRecorderConfig]):
     def setup(self) -> None:
         if self.run_dir is None:
             raise NodeError("the recorder needs the real bus; lockstep replay records by itself")
-        self._live = LiveTopics(self.run_dir)
+        self._topics = TopicWatch(self.run_dir)
+        self._next_nodes_s = 0.0
         choice = TopicChoice(self.config.topics, self.config.exclude)
         sim_now_ns = self.clock.now_ns if self.use_sim_time else None
         try:
@@ -67,7 +70,12 @@ class BagRecorderNode(Node[BagRecorderConfig]):
         return self.subscribe_received(topic, forward, RECORD).raw.stats
 
     def _discover(self) -> None:
-        self.recorder.discover(*self._live.look())
+        assert self.run_dir is not None
+        nodes: list[NodeInfo] = []
+        if time.monotonic() >= self._next_nodes_s:
+            self._next_nodes_s = time.monotonic() + _NODES_S
+            nodes = list_nodes(self.run_dir)
+        self.recorder.discover(self._topics.topics(), nodes)
         self.recorder.tick()
 
     def _snapshot(self, reason: str = "") -> dict[str, Any]:

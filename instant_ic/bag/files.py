@@ -74,12 +74,9 @@ class BagReader(Closing):
             raise BagError(self._why_no_metadata()) from None
         except BagError:
             raise
-        except (ReaderError, OSError) as error:
-            raise BagError(f"bag {path} cannot be read: {error}; if it was cut: ic bag recover {path}") from None
         except Exception as error:  # noqa: BLE001 - a parser may raise anything on bytes that are not a bag
-            raise BagError(
-                f"bag {path} cannot be read: {type(error).__name__}: {error}; if it was cut: ic bag recover {path}"
-            ) from None
+            why = error if isinstance(error, ReaderError | OSError) else f"{type(error).__name__}: {error}"
+            raise BagError(f"bag {path} cannot be read: {why}; if it was cut: ic bag recover {path}") from None
         for connection in self._reader.connections:
             if not (isinstance(connection.topic, str) and isinstance(connection.msgtype, str)):
                 self._reader.close()
@@ -189,9 +186,9 @@ class BagReader(Closing):
                     f"bag {self.path}, topic {connection.topic}: its messages are {encoding!r}, not CDR. Choose other "
                     f"topics, or copy those in CDR: ic bag recover {self.path}"
                 )
-        repetitions = Repetitions(part.start_ns for part in self.parts[1:] if part.count)
         presets = {(c.topic, c.msgtype): _qos(c) for c in connections}
         try:
+            repetitions = Repetitions(part.start_ns for part in self.parts[1:] if part.count)
             with closing(self._raw(connections, start_ns, stop_ns)) as raw:
                 for connection, stamp_ns, payload in raw:
                     qos = presets[connection.topic, connection.msgtype]

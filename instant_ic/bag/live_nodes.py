@@ -9,10 +9,9 @@ from pathlib import Path
 
 from instant_ic.bag.message import BagError
 from instant_ic.bus.heartbeat import EVERY_NODES
-from instant_ic.bus.registry import NodeInfo, TopicInfo, TopicWatch, list_nodes
+from instant_ic.bus.registry import NodeInfo, list_nodes
 from instant_ic.bus.topics import Publisher
 
-_NODES_S = 2.0  # period of the search for nodes, which costs more than that for topics
 _WAIT_S = 60.0
 _BASE = "crawler_base"
 _BRIDGES = ("host_bridge", "zenoh_gateway")
@@ -26,23 +25,6 @@ _ACTED_ON = (
 """Topics that a robot's nodes act on, in the namespace of its base."""
 _HARMLESS = {"/clock", *EVERY_NODES}
 """On any other topic a second publisher would mix the bag with the live robot."""
-
-
-class LiveTopics:
-    """Topics of a run directory, and from time to time its nodes."""
-
-    def __init__(self, run_dir: Path) -> None:
-        self._run_dir = run_dir
-        self._watch = TopicWatch(run_dir)
-        self._next_nodes_s = 0.0
-
-    def look(self) -> tuple[list[TopicInfo], list[NodeInfo]]:
-        """Return the topics with a publisher, and the nodes if they are due."""
-        nodes: list[NodeInfo] = []
-        if time.monotonic() >= self._next_nodes_s:
-            self._next_nodes_s = time.monotonic() + _NODES_S
-            nodes = list_nodes(self._run_dir)
-        return self._watch.topics(), nodes
 
 
 def reached_base(nodes: Collection[NodeInfo], played: Mapping[str, str]) -> tuple[str, list[str]] | None:

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import yaml
 from rosbags.interfaces import (
@@ -30,6 +29,9 @@ from instant_ic.config.yaml_text import dump_yaml, read_yaml
 from instant_ic.msg import MessageError, message_type, type_hash, typestore
 from instant_ic.util.files import replacing
 
+if TYPE_CHECKING:
+    from instant_ic.bag.mcap_writer import McapWriter
+
 METADATA_FILE = "metadata.yaml"
 # The values that DDS writes for "no limit" and rosbag2 for the start of an empty bag.
 _FOREVER = QosTime(2147483647, 4294967295)
@@ -39,18 +41,7 @@ Topics = dict[Topic, tuple[QoS, Schema]]
 """QoS and type of the topics of a bag."""
 
 
-class WrittenFile(Protocol):
-    """A complete file of a bag, see :class:`McapWriter`."""
-
-    @property
-    def path(self) -> Path: ...
-    @property
-    def counts(self) -> Counter[Topic]: ...
-    @property
-    def span_ns(self) -> tuple[int, int]: ...
-
-
-def write_metadata(folder: Path, files: Sequence[WrittenFile], topics: Topics, custom: Mapping[str, str]) -> None:
+def write_metadata(folder: Path, files: Sequence[McapWriter], topics: Topics, custom: Mapping[str, str]) -> None:
     """Write ``metadata.yaml`` (rosbag2, version 9) atomically: readers see either the old or the new file.
 
     Raises:
@@ -86,7 +77,7 @@ def write_metadata(folder: Path, files: Sequence[WrittenFile], topics: Topics, c
         stream.write(text.encode())
 
 
-def _span(files: Sequence[WrittenFile]) -> dict[str, Any]:
+def _span(files: Sequence[McapWriter]) -> dict[str, Any]:
     spans = [file.span_ns for file in files if file.counts]
     start_ns = min((start_ns for start_ns, _ in spans), default=_NO_START)
     end_ns = max((end_ns for _, end_ns in spans), default=_NO_START)
