@@ -128,7 +128,10 @@ def load_grid(path: Path) -> OccupancyGrid:
         raise MapError(f"{image} cannot be decoded as an image")
     grey = picture[::-1].astype(np.float64)
     values = np.full(grey.shape, -1, dtype=np.int8)
-    negate = resolved(content.get("negate"))
+    try:
+        negate = resolved(content.get("negate"))
+    except yaml.YAMLError as error:
+        raise MapError(f"{path}: negate must be 0 or 1: {error}") from None
     share = grey / 255 if negate else (255 - grey) / 255
     # Grey 205 is unknown, whatever the threshold: nav2 writes 0.25, which would make it free.
     unknown = (grey == 205) & (not negate)
