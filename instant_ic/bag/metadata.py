@@ -1,12 +1,11 @@
-"""Everything in a bag except its messages: ``metadata.yaml``, QoS profiles, type definitions."""
+"""QoS profiles and type definitions of the topics in a bag."""
 
 from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Collection, Mapping, Sequence
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from collections.abc import Collection
+from typing import Any
 
 import yaml
 from rosbags.interfaces import (
@@ -27,64 +26,12 @@ from instant_ic.bag.message import Schema, Topic
 from instant_ic.bus.qos import LATCHED, RELIABLE, SENSOR, QoS
 from instant_ic.config.yaml_text import dump_yaml, read_yaml
 from instant_ic.msg import MessageError, message_type, type_hash, typestore
-from instant_ic.util.files import replacing
-
-if TYPE_CHECKING:
-    from instant_ic.bag.mcap_writer import McapWriter
-
-METADATA_FILE = "metadata.yaml"
-# The values that DDS writes for "no limit" and rosbag2 for the start of an empty bag.
-_FOREVER = QosTime(2147483647, 4294967295)
-_NO_START = (1 << 63) - 1
 
 Topics = dict[Topic, tuple[QoS, Schema]]
 """QoS and type of the topics of a bag."""
 
-
-def write_metadata(folder: Path, files: Sequence[McapWriter], topics: Topics, custom: Mapping[str, str]) -> None:
-    """Write ``metadata.yaml`` (rosbag2, version 9) atomically: readers see either the old or the new file.
-
-    Raises:
-        OSError: the file cannot be written.
-    """
-    information = {
-        "version": 9,
-        "storage_identifier": "mcap",
-        "relative_file_paths": [file.path.name for file in files],
-        **_span(files),
-        "message_count": sum(file.counts.total() for file in files),
-        "topics_with_message_count": [
-            {
-                "topic_metadata": {
-                    "name": topic,
-                    "type": type_name,
-                    "serialization_format": "cdr",
-                    "offered_qos_profiles": dump_qos_v9([ros_qos(qos)]),
-                    "type_description_hash": schema.type_hash,
-                },
-                "message_count": sum(file.counts[topic, type_name] for file in files),
-            }
-            for (topic, type_name), (qos, schema) in topics.items()
-        ],
-        "compression_format": "",
-        "compression_mode": "",
-        "files": [{"path": file.path.name, **_span([file]), "message_count": file.counts.total()} for file in files],
-        "custom_data": dict(custom) or None,
-        "ros_distro": "jazzy",
-    }
-    text = dump_yaml({"rosbag2_bagfile_information": information}, width=1000)
-    with replacing(folder / METADATA_FILE, private=True, sync=True) as stream:
-        stream.write(text.encode())
-
-
-def _span(files: Sequence[McapWriter]) -> dict[str, Any]:
-    spans = [file.span_ns for file in files if file.counts]
-    start_ns = min((start_ns for start_ns, _ in spans), default=_NO_START)
-    end_ns = max((end_ns for _, end_ns in spans), default=_NO_START)
-    return {
-        "duration": {"nanoseconds": end_ns - start_ns},
-        "starting_time": {"nanoseconds_since_epoch": start_ns},
-    }
+_FOREVER = QosTime(2147483647, 4294967295)
+"""The value that DDS writes for "no limit"."""
 
 
 @functools.cache

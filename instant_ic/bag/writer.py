@@ -5,21 +5,29 @@ from __future__ import annotations
 import errno
 import logging
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import Any
+
+from rosbags.rosbag2.metadata import dump_qos_v9
 
 from instant_ic.bag.latched import LatchedValues
 from instant_ic.bag.mcap_writer import Buffer, McapWriter
 from instant_ic.bag.message import BagError, BagMessage, DiskFullError, Schema, Topic
-from instant_ic.bag.metadata import Topics, schema_or_unknown, write_metadata
+from instant_ic.bag.metadata import Topics, ros_qos, schema_or_unknown
 from instant_ic.bus.qos import SENSOR, QoS
+from instant_ic.config.yaml_text import dump_yaml
 from instant_ic.util.closing import Closing
+from instant_ic.util.files import replacing
 from instant_ic.util.private import make_folder, sync_folder
 
 log = logging.getLogger(__name__)
 
 _FULL = (errno.ENOSPC, errno.EDQUOT)
+
+_NO_START = (1 << 63) - 1
+"""Start of an empty bag, as rosbag2 writes it."""
 
 CUSTOM_RECORD = "instant_ic"
 """Name of the metadata record that holds ``custom_data`` in a file while the bag is being written."""
@@ -244,3 +252,49 @@ class BagWriter(Closing):
         except OSError as error:
             hint = f"; make room, then ic bag recover {self.path}" if error.errno in _FULL else ""
             raise BagError(f"bag {self.path}: metadata.yaml cannot be written: {error.strerror}{hint}") from error
+
+
+def write_metadata(folder: Path, files: Sequence[McapWriter], topics: Topics, custom: Mapping[str, str]) -> None:
+    """Write ``metadata.yaml`` (rosbag2, version 9) atomically: readers see either the old or the new file.
+
+    Raises:
+        OSError: the file cannot be written.
+    """
+    information = {
+        "version": 9,
+        "storage_identifier": "mcap",
+        "relative_file_paths": [file.path.name for file in files],
+        **_span(files),
+        "message_count": sum(file.counts.total() for file in files),
+        "topics_with_message_count": [
+            {
+                "topic_metadata": {
+                    "name": topic,
+                    "type": type_name,
+                    "serialization_format": "cdr",
+                    "offered_qos_profiles": dump_qos_v9([ros_qos(qos)]),
+                    "type_description_hash": schema.type_hash,
+                },
+                "message_count": sum(file.counts[topic, type_name] for file in files),
+            }
+            for (topic, type_name), (qos, schema) in topics.items()
+        ],
+        "compression_format": "",
+        "compression_mode": "",
+        "files": [{"path": file.path.name, **_span([file]), "message_count": file.counts.total()} for file in files],
+        "custom_data": dict(custom) or None,
+        "ros_distro": "jazzy",
+    }
+    text = dump_yaml({"rosbag2_bagfile_information": information}, width=1000)
+    with replacing(folder / "metadata.yaml", private=True, sync=True) as stream:
+        stream.write(text.encode())
+
+
+def _span(files: Sequence[McapWriter]) -> dict[str, Any]:
+    spans = [file.span_ns for file in files if file.counts]
+    start_ns = min((start_ns for start_ns, _ in spans), default=_NO_START)
+    end_ns = max((end_ns for _, end_ns in spans), default=_NO_START)
+    return {
+        "duration": {"nanoseconds": end_ns - start_ns},
+        "starting_time": {"nanoseconds_since_epoch": start_ns},
+    }
