@@ -27,12 +27,12 @@ class GridSlamNode(Node[GridSlamConfig]):
 
     def setup(self) -> None:
         warm_up(self.config)
+        self.commands = {"save": self.save}
         self.poll: Any = None  # timer while scans wait for odometry, which may have gone silent
         self.worker = self.background(slam_messages.run_job, self.take_over)
         self.queue = ScanQueue(self.config)
         self.limiter = CorrectionLimiter()
         self.map_out = self.publisher("/map", msg.OccupancyGrid, qos=LATCHED)
-        self.saved_out = self.publisher("/slam/saved", msg.String, qos=RELIABLE)
         self.pose_out = self.publisher("/pose", msg.PoseWithCovarianceStamped, qos=SENSOR)
         self.integrity_out = self.publisher("/slam/integrity", msg.PoseIntegrity, qos=SENSOR)
         self.restart()
@@ -42,7 +42,6 @@ class GridSlamNode(Node[GridSlamConfig]):
         if self.config.use_wheel_odom:
             self.subscribe("/wheel/odom", msg.Odometry, self.on_odometry, qos=ODOMETRY_QUEUE)
         self.subscribe("/scan", msg.LaserScan, self.on_scan, qos=SENSOR)
-        self.subscribe("/slam/save", msg.String, self.on_save, qos=RELIABLE)
         self.subscribe("/initialpose", msg.PoseWithCovarianceStamped, self.on_initial_pose, qos=RELIABLE)
         self.timer(self.config.map_period_s, self.publish_map)
         self.timer(1.0, self.watch)
@@ -126,11 +125,11 @@ class GridSlamNode(Node[GridSlamConfig]):
         except ValueError as error:
             self.log.warning("/initialpose is not used: %s", error)
 
-    def on_save(self, message: Any) -> None:
-        """Write the map to the path in the message; the answer goes to /slam/saved."""
-        answer = slam_messages.save_answer(self.slam, Path(message.data))
-        self.log.info("%s", answer)
-        self.saved_out.publish(msg.String(data=answer))
+    def save(self, path: str) -> list[str]:
+        """Write the map to ``path``, without a suffix, and return the files; raises MapError, a ValueError."""
+        files = [str(file) for file in self.slam.save(Path(path))]
+        self.log.info("saved: %s", ", ".join(files))
+        return files
 
     def publish_map(self) -> None:
         """Publish the map if it has changed."""

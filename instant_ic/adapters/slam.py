@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -94,14 +93,6 @@ def map_message(slam: GridSlam, stamp: int) -> Any:
     """Return the map as an OccupancyGrid."""
     values, resolution, origin = slam.grid()
     return grid_message(values, resolution, (float(origin[0]), float(origin[1])), "map", stamp)
-
-
-def save_answer(slam: GridSlam, stem: Path) -> str:
-    """Save the map; return which files were written, or the error."""
-    try:
-        return "saved: " + ", ".join(str(file) for file in slam.save(stem))
-    except ValueError as error:
-        return f"error: {error}"
 
 
 def transforms(

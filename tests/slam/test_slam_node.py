@@ -17,7 +17,6 @@ from instant_ic.geometry.transforms import TransformBuffer
 from instant_ic.msg import (
     PoseWithCovariance,
     PoseWithCovarianceStamped,
-    String,
     TFMessage,
     grid_array,
     header,
@@ -210,15 +209,13 @@ def test_two_runs_are_the_same_bit_for_bit() -> None:
 
 
 def save_box_map(folder: Path) -> Path:
-    """The box room's map, saved through the node's topic; its origin is the start of the rig."""
+    """The box room's map, saved through the node's command; its origin is the start of the rig."""
     rig = Rig()
     rig.wheel()
     rig.scan()
     rig.drive(0.4, 0.4, 60)
     stem = folder / "maps" / "box"
-    rig.bus.publish("/slam/save", String(data=str(stem)), stamp_ns=rig.now_ns)
-    answer = rig.bus.last("/slam/saved").data
-    assert answer.startswith("saved: ") and str(stem) in answer
+    assert rig.node.commands["save"](path=str(stem))[0] == f"{stem}.yaml"
     return stem
 
 
@@ -226,8 +223,8 @@ def test_the_map_is_saved_on_request_and_a_fault_is_told(tmp_path: Path) -> None
     stem = save_box_map(tmp_path)
     assert sorted(file.name for file in stem.parent.iterdir()) == ["box.graph.npz", "box.pgm", "box.yaml"]
     rig = Rig()
-    rig.bus.publish("/slam/save", String(data=str(tmp_path / "none")), stamp_ns=rig.now_ns)
-    assert rig.bus.last("/slam/saved").data == "error: the map is empty: nothing to save"
+    with pytest.raises(ValueError, match="the map is empty: nothing to save"):
+        rig.node.commands["save"](path=str(tmp_path / "none"))
 
 
 @pytest.mark.parametrize("mode", ["localization", "mapping"])

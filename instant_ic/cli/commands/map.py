@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import argparse
-import time
 from pathlib import Path
 from typing import Any
 
 from instant_ic.cli.arguments import check_files, group, positive, verb
 from instant_ic.cli.errors import UserError
 
-SAVE, SAVED, LOCAL = "/slam/save", "/slam/saved", "/map/local"
+LOCAL = "/map/local"
 
 
 def add_parser(subparsers: Any) -> None:
@@ -34,33 +33,22 @@ def add_parser(subparsers: Any) -> None:
 
 
 def save_map(args: argparse.Namespace) -> int:
-    from instant_ic.bus import RELIABLE
-    from instant_ic.bus.topics import Publisher
-    from instant_ic.cli.observer import TopicObserver
-    from instant_ic.msg import deserialize, message_type, type_name
+    from instant_ic.bus.control import ControlError, NodeControl
+    from instant_ic.bus.registry import list_nodes
+    from instant_ic.util.paths import run_dir
 
     name = args.name.expanduser().absolute()
     if name.suffix in (".yaml", ".pgm"):
         raise UserError(f"NAME must have no suffix: {name.with_suffix('')}", 2)
-    string = message_type("String")
-    deadline = time.monotonic() + args.timeout
-    with TopicObserver([SAVED]) as observer:
-        request = Publisher(observer.transport.advertise(SAVE, type_name(string), RELIABLE))
-        while request.subscriber_count == 0:
-            if time.monotonic() > deadline:
-                raise UserError("cannot save the map: grid_slam is not running (ic node list)")
-            time.sleep(0.05)
-        request.publish(string(data=str(name)))
-        for batch in observer.batches(max(deadline - time.monotonic(), 0.1), 0.1):
-            for received in batch:
-                answer = str(deserialize(received.payload, received.type_name).data)
-                if str(name) not in answer and answer.startswith("saved"):
-                    continue  # answers another client's request
-                if not answer.startswith("saved"):
-                    raise UserError(answer.removeprefix("error: "))
-                print(answer)
-                return 0
-    raise UserError(f"grid_slam did not answer in {args.timeout:g} s (ic log grid_slam)")
+    running = [node.name for node in list_nodes(run_dir()) if node.executable == "grid_slam"]
+    if not running:
+        raise UserError("cannot save the map: grid_slam is not running (ic node list)")
+    try:
+        files = NodeControl(run_dir(), running[0], args.timeout).call("save", path=str(name))
+    except ControlError as error:
+        raise UserError(str(error)) from None
+    print("saved: " + ", ".join(files))
+    return 0
 
 
 def save_local(args: argparse.Namespace) -> int:
