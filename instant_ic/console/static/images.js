@@ -5,10 +5,10 @@
 /** @import { Look } from "./look.js" */
 /** @import { Mat3, Vec3 } from "./math.js" */
 /** @import { Camera, Layer, Photo, Surface } from "./layers.js" */
-/** @import { LayerData, LayersFrame, LayersHeader, Mesh, PageSettings, PanoramaFrame, PanoramaHeader, State, ViewFrame, ViewHeader } from "./messages.js" */
+/** @import { FrameOf, LayerData, LayersFrame, LayersHeader, Mesh, PageSettings, PanoramaHeader, State, ViewHeader } from "./messages.js" */
 /** @import { GlViewer } from "./viewer.js" */
 import { fitGains, plain, Releasing } from "./colour.js";
-import { clamp, fromQuaternion, identity, lookRotation, multiply, rotate, rotationZ, times, transpose } from "./math.js";
+import { clamp, fromQuaternion, identity, lookRotation, mounted, multiply, rotationZ, times, transpose } from "./math.js";
 import { DEFAULT_PAGE, PANORAMA, VIEW } from "./messages.js";
 import { Motion } from "./motion.js";
 import { Prediction } from "./prediction.js";
@@ -93,7 +93,7 @@ export class Images {
     for (const gains of Object.values(this._gains)) gains.releaseMs = 1000 * colour_release_s; // 0: no matching
   }
 
-  /** Decodes an image, passes it to the viewer, then acknowledges it. @param {PanoramaFrame | ViewFrame} frame */
+  /** Decodes an image, passes it to the viewer, then acknowledges it. @param {FrameOf<1> | FrameOf<2>} frame */
   async take(frame) {
     try {
       const bitmap = await decoded(frame.payload);
@@ -245,10 +245,9 @@ export class Images {
     const { panorama, layers } = this, { pose } = this.motion;
     if (!this.glides || !panorama?.q || !panorama.p || !pose || !layers || !this.rendersLayers) return null;
     if (state && state.at_ms - panorama.captured_ms > FROZEN_MS) return null;
-    const [x, y] = rotate(rotationZ(pose[2]), layers.mount), [px, py, pz] = panorama.p;
-    if (Math.hypot(pose[0] + x - px, pose[1] + y - py) > ELSEWHERE_M) return null;
-    const from = { mapFromCamera: fromQuaternion(panorama.q), position: panorama.p };
-    return { from, to: [pose[0] + x, pose[1] + y, pz] };
+    const [x, y] = mounted(pose, layers.mount), [px, py, pz] = panorama.p;
+    if (Math.hypot(x - px, y - py) > ELSEWHERE_M) return null;
+    return { from: { mapFromCamera: fromQuaternion(panorama.q), position: panorama.p }, to: [x, y, pz] };
   }
 
   /**
@@ -260,7 +259,7 @@ export class Images {
   _camera({ mount }, mapFromLook, tanHalf, glide) {
     const { own } = this.motion, before = this._followed;
     if (own) {
-      const [dx, dy] = rotate(rotationZ(own[2]), mount), x = own[0] + dx, y = own[1] + dy;
+      const [x, y] = mounted(own, mount);
       if (this._virtual || !this._now) this._now = [x, y];
       else if (before) this._now = [this._now[0] + x - before[0], this._now[1] + y - before[1]];
       this._followed = this._virtual ? null : [x, y];

@@ -41,6 +41,15 @@ export function rotate(m, v) {
   ];
 }
 
+/**
+ * Returns the position in the map of a place on a robot.
+ * @param {Vec3} pose x, y, yaw @param {readonly number[]} place x and y on the robot @returns {[number, number]}
+ */
+export function mounted([x, y, yaw], [ahead, left]) {
+  const c = Math.cos(yaw), s = Math.sin(yaw);
+  return [x + c * ahead - s * left, y + s * ahead + c * left];
+}
+
 /** @param {Vec3} a @param {Vec3} b @returns {Vec3} */
 export const times = (a, b) => [a[0] * b[0], a[1] * b[1], a[2] * b[2]];
 

@@ -171,10 +171,14 @@ const KINDS = /** @type {const} */ ([PANORAMA, VIEW, MAP, COSTMAP, LAYERS, PART]
 const PREFIX_BYTES = 12;
 const VERSION = 1;
 
-const panoramaHeader = object({ captured_ms: number, q: optional(quaternion), p: optional(triple) });
-const viewHeader = object({ captured_ms: number, q: quaternion, p: triple, fov: number });
 const gridHeader = object({ resolution: number, width: number, height: number, x: number, y: number });
-const partHeader = object({ start: number, size: number });
+const HEADERS = {
+  [PANORAMA]: object({ captured_ms: number, q: optional(quaternion), p: optional(triple) }),
+  [VIEW]: object({ captured_ms: number, q: quaternion, p: triple, fov: number }),
+  [MAP]: gridHeader,
+  [COSTMAP]: gridHeader,
+  [PART]: object({ start: number, size: number }),
+};
 const MOST_LAYERS = 8; // bits of the stencil buffer
 const parts = object({ inverse: pair, triangles: pair, corners: pair, image: pair, confidence: pair });
 const layersHeader = object({
@@ -202,14 +206,14 @@ const layersHeader = object({
  */
 /** @typedef {Omit<ReturnType<typeof layersHeader>, "layers">} LayersHeader */
 /** @typedef {{kind: 5, sequence: number, header: LayersHeader, layers: LayerData[]}} LayersFrame */
-/** @typedef {ReturnType<typeof panoramaHeader>} PanoramaHeader */
-/** @typedef {ReturnType<typeof viewHeader>} ViewHeader */
-/** @typedef {ReturnType<typeof gridHeader>} GridHeader */
-/** @typedef {{kind: 1, sequence: number, header: PanoramaHeader, payload: Blob}} PanoramaFrame */
-/** @typedef {{kind: 2, sequence: number, header: ViewHeader, payload: Blob}} ViewFrame */
-/** @typedef {{kind: 3 | 4, sequence: number, header: GridHeader, payload: Blob}} GridFrame */
-/** @typedef {PanoramaFrame | ViewFrame | GridFrame | LayersFrame} Frame */
-/** @typedef {{kind: 6, sequence: number, header: ReturnType<typeof partHeader>, payload: Blob}} PartFrame */
+/** @template {keyof typeof HEADERS} K @typedef {ReturnType<(typeof HEADERS)[K]>} Header */
+/** @template {keyof typeof HEADERS} K @typedef {{kind: K, sequence: number, header: Header<K>, payload: Blob}} FrameOf */
+/** @typedef {Header<1>} PanoramaHeader */
+/** @typedef {Header<2>} ViewHeader */
+/** @typedef {Header<3>} GridHeader */
+/** @typedef {FrameOf<3> | FrameOf<4>} GridFrame */
+/** @typedef {FrameOf<1> | FrameOf<2> | GridFrame | LayersFrame} Frame */
+/** @typedef {FrameOf<6>} PartFrame */
 
 /** Assembler of a frame that comes in pieces, in order. */
 export class Parts {
@@ -250,14 +254,8 @@ export function decodeFrame(buffer) {
   const header = parsed(new TextDecoder().decode(new Uint8Array(buffer, PREFIX_BYTES, headerEnd - PREFIX_BYTES)));
   if (kind === LAYERS) return { kind, sequence, ...decodeLayers(header, buffer.slice(headerEnd)) };
   const payload = new Blob([new Uint8Array(buffer, headerEnd)]);
-  switch (kind) {
-    case PANORAMA: return { kind, sequence, header: panoramaHeader(header, "panorama"), payload };
-    case VIEW: return { kind, sequence, header: viewHeader(header, "view"), payload };
-    case MAP:
-    case COSTMAP: return { kind, sequence, header: gridHeader(header, "grid"), payload };
-    case PART: return { kind, sequence, header: partHeader(header, "part"), payload };
-    default: return refuse("frame.kind", "1 to 6", kind);
-  }
+  const read = Object.hasOwn(HEADERS, kind) ? HEADERS[/** @type {keyof typeof HEADERS} */ (kind)] : refuse("frame.kind", "1 to 6", kind);
+  return /** @type {Frame | PartFrame} */ ({ kind, sequence, header: read(header, `frame ${kind}`), payload });
 }
 
 /**

@@ -13,7 +13,7 @@ import { byId, mark } from "./dom.js";
 import { showCompass, showGuide } from "./guide.js";
 import { showLatency } from "./hud.js";
 import { shows } from "./images.js";
-import { radians, transpose } from "./math.js";
+import { mounted, radians, transpose } from "./math.js";
 import { DEFAULT_PAGE, VIEW } from "./messages.js";
 import { MiniMap } from "./minimap.js";
 import { saveView } from "./save.js";
@@ -50,9 +50,9 @@ export class Screen {
     this._direction = [];
     this._sentLook = this._viewKey = this._reported = "";
     this._reportedAt = 0;
-    link.addEventListener("open", () => {
-      this._sentLook = "";
-      this._reported = "";
+    for (const name of ["open", "lost"]) link.addEventListener(name, () => {
+      this._sentLook = this._reported = "";
+      this._latencyAt = 0;
     });
     document.addEventListener("visibilitychange", () => { this._steppedAt = performance.now(); });
   }
@@ -216,11 +216,10 @@ export class Screen {
 
   /** Position of the shown camera in the map frame; null: unknown. @returns {Vec3 | null} */
   _cameraPosition() {
-    const { motion, blend, place } = this.images, [cx, cy, cz] = this.settings.camera;
+    const { motion, blend, place } = this.images, [x, y, z] = this.settings.camera;
     if (!motion.pose) return null;
-    if (blend > 0.5 && place) return [place[0], place[1], cz];
-    const [x, y, yaw] = motion.pose;
-    return [x + Math.cos(yaw) * cx - Math.sin(yaw) * cy, y + Math.sin(yaw) * cx + Math.cos(yaw) * cy, cz];
+    const [px, py] = blend > 0.5 && place ? place : mounted(motion.pose, [x, y]);
+    return [px, py, z];
   }
 }
 

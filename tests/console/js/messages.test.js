@@ -59,8 +59,8 @@ test("frames that cannot be decoded are refused", () => {
     [frame(1, header, { version: 2 }), /version must be 1/],
     [frame(9, header), /kind must be 1 to 6/],
     [frame(1, header, { length: 999 }), /at least 1011 bytes/],
-    [frame(2, header), /view\.q must be a list/],
-    [frame(3, header), /grid\.resolution must be a finite number/],
+    [frame(2, header), /frame 2\.q must be a list/],
+    [frame(3, header), /frame 3\.resolution must be a finite number/],
     [frame(1, header, { length: 4 }), /not valid JSON/],
   ]) assert.throws(() => decodeFrame(buffer), text);
 });
