@@ -24,8 +24,6 @@ const LATENCY_MS = 250;
 const SLOW_FRAME_MS = 45; // shortest frame time when the CPU renders, with fewer pixels
 const SLOW_PIXELS = 0.45; // share of the window's pixels per axis
 const STILL_PIXELS = 0.5, LEAST_PIXELS = 0.3; // smallest shown turn while the robot stands, and while the v-bot is driven
-const REPORT_MS = 500; // longest interval between two reports of the shown state while the camera is shown
-const IDLE_MS = 200; // longest interval between two frames while messages arrive
 
 export class Screen {
   /** @param {GlViewer} viewer @param {Images} images @param {Look} look @param {Link} link @param {Lease} lease */
@@ -42,14 +40,13 @@ export class Screen {
     this.plan = { trajectory: [], path: [], subgoal: null };
     /** @type {PageSettings} */
     this.settings = DEFAULT_PAGE;
-    this._frameAt = this._viewAt = this._steppedAt = performance.now();
+    this._viewAt = this._steppedAt = performance.now();
     this._requested = this._wanted = false;
     this._timer = 0;
     this._latencyAt = this._lookAt = 0;
     /** Rotation and field of view of the last rendered image. @type {number[]} */
     this._direction = [];
     this._sentLook = this._viewKey = this._reported = "";
-    this._reportedAt = 0;
     for (const name of ["open", "lost"]) link.addEventListener(name, () => {
       this._sentLook = this._reported = "";
       this._latencyAt = 0;
@@ -59,24 +56,19 @@ export class Screen {
 
   /** Takes a state message. @param {State} state */
   take(state) {
-    const same = this.state && JSON.stringify({ ...this.state, at_ms: state.at_ms }) === JSON.stringify(state);
     this.state = state;
-    if (!same || performance.now() - this._frameAt > IDLE_MS) this.wake();
-    else if (!this._wanted) this._reportShown();
+    this.wake();
   }
 
-  /** Reports that the newest state is on the screen, if this page renders the virtual space by itself. */
+  /** Reports that the newest state is on the screen if this page renders the virtual space by itself; else, that it needs views. */
   _reportShown() {
     const { state, images, link } = this;
     if (!state) return;
     images.shownMs = state.at_ms;
-    if (!link.connected) return;
     const version = images.rendersLayers && images.layers ? images.layers.version : 0;
-    const soon = state.mode === "virtual" || state.mode === "entering" || state.mode === "returning";
-    const key = version === 0 ? "0" : `${version} ${soon}`, now = performance.now();
-    if (key === this._reported && (version === 0 || (!soon && now - this._reportedAt < REPORT_MS))) return;
+    const key = version === 0 ? "0" : `${version} ${state.at_ms}`;
+    if (!link.connected || key === this._reported) return;
     this._reported = key;
-    this._reportedAt = now;
     link.send({ type: "drawn", version, state_ms: state.at_ms });
   }
 
@@ -117,7 +109,6 @@ export class Screen {
   /** Sends the look direction, and renders what has changed; returns whether something moves. @param {number} now */
   _renderFrame(now) {
     const elapsed = Math.min(Math.max(now - this._steppedAt, 0), 200);
-    this._frameAt = now;
     this._steppedAt = Math.max(now, this._steppedAt);
     this.look.step(elapsed / 1000);
     const tanHalf = this._tanHalf(), waits = this._sendLook(tanHalf, now);
@@ -187,7 +178,7 @@ export class Screen {
     this._viewKey = key;
     this._direction = direction;
     images.changed = false;
-    this._viewAt = this._frameAt; // only such a frame costs a pause: in the first after a key nothing has moved yet
+    this._viewAt = this._steppedAt; // only such a frame costs a pause: in the first after a key nothing has moved yet
     images.startFrame();
     viewer.render(scene);
     if (scene.camera && scene.blend > 0) images.countFrame(VIEW);
