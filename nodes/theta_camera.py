@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from instant_ic.bus import ERROR, OK, SENSOR, WARN, Node, NodeError, main
 from instant_ic.camera.config import ThetaCameraConfig
-from instant_ic.camera.device import health, open_camera
+from instant_ic.camera.device import open_camera
 from instant_ic.camera.files import FileCamera
 from instant_ic.camera.liveness import LiveImages
 from instant_ic.camera.loop import CameraLoop
@@ -41,9 +41,9 @@ class ThetaCameraNode(Node[ThetaCameraConfig]):
             on_event=lambda connected, text: self.call_soon(self.on_event, connected, text),
         )
         if isinstance(self.camera, ThetaCamera):
-            worker = self.background(health, self.diagnose_all)
             client = self.camera.client
-            self.timer(config.health_period_s, lambda: worker.submit(client))
+            worker = self.background(lambda _: client.health(), self.diagnose_all)
+            self.timer(config.health_period_s, lambda: worker.submit(None))
         self.loop.start()
 
     def broadcast_mount(self) -> None:

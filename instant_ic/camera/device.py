@@ -1,4 +1,4 @@
-"""The camera that the parameters of the node ``theta_camera`` select, and the Theta's health."""
+"""The camera that the parameters of the node ``theta_camera`` select."""
 
 from __future__ import annotations
 
@@ -11,15 +11,11 @@ from instant_ic.camera.files import FileCamera
 from instant_ic.camera.source import Camera, CameraError
 from instant_ic.camera.theta import ThetaCamera, ThetaClient
 from instant_ic.camera.video import VideoCamera
-from instant_ic.util.diagnosis import Diagnosis, Level
 from instant_ic.util.private import read_secret
 
 USER_VARIABLE = "INSTANT_IC_THETA_USER"
 PASSWORD_VARIABLE = "INSTANT_IC_THETA_PASSWORD"
 """Environment variable for the credentials: parameters are visible in ``ic param`` and in files."""
-
-_BATTERY_LOW = 0.2  # share of the charge
-_BOARD_HOT_C = 70.0
 
 
 def open_camera(config: ThetaCameraConfig, now_ns: Callable[[], int]) -> Camera:
@@ -54,25 +50,3 @@ def _credentials(file: str) -> tuple[str, str]:
     if not colon:
         raise CameraError(f"password_file {path}: must hold USER:PASSWORD in one line")
     return user, password
-
-
-def health(client: ThetaClient) -> Diagnosis:
-    """Ask a Theta for battery, temperature and errors, which may take seconds; return them as a diagnosis."""
-    try:
-        state = client.state()
-    except CameraError as error:
-        return Diagnosis("health", Level.WARN, str(error))
-    low = state.battery is not None and state.battery < _BATTERY_LOW
-    hot = state.board_temperature_c is not None and state.board_temperature_c >= _BOARD_HOT_C
-    text = [
-        *(["battery is low: charge it"] if low else []),
-        *(["the camera is hot: switch it off to cool down"] if hot else []),
-        *state.errors,
-    ]
-    values = {
-        "battery": state.battery,
-        "battery_temperature_c": state.battery_temperature_c,
-        "board_temperature_c": state.board_temperature_c,
-    }
-    level = Level.ERROR if state.errors else Level.WARN if low or hot else Level.OK
-    return Diagnosis("health", level, ", ".join(text) or "no faults", values)

@@ -6,7 +6,6 @@ import re
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import requests
@@ -16,6 +15,7 @@ from instant_ic.camera.config import FORMATS_FIRMWARE, OLD_PREVIEW_FORMATS, Thet
 from instant_ic.camera.http import DeviceSession, is_multipart
 from instant_ic.camera.preview import PreviewParser
 from instant_ic.camera.source import Camera, CameraError, Frame
+from instant_ic.util.diagnosis import Diagnosis, Level
 from instant_ic.util.jpeg import JpegError, jpeg_size
 from instant_ic.util.limits import MOST_PIXELS
 from instant_ic.util.pace import current
@@ -28,6 +28,8 @@ _NEVER_READ = (0, NEVER)
 Format = tuple[int, int, int]
 """Width, height and frame rate of the preview."""
 
+_BATTERY_LOW = 0.2  # share of the charge
+_BOARD_HOT_C = 70.0
 _CHUNK = 64 << 10
 _MOST_TEXT = 200
 """Characters of a text from the camera that go into logs and diagnostics."""
@@ -48,23 +50,6 @@ class ThetaError(CameraError):
         self.code = code
 
 
-@dataclass(frozen=True)
-class ThetaState:
-    """State that the camera reports.
-
-    Attributes:
-        battery: charge, 0-1; None if not reported.
-        battery_temperature_c: degrees Celsius; None if not reported.
-        board_temperature_c: degrees Celsius; None if not reported.
-        errors: error codes, such as HIGH_TEMPERATURE.
-    """
-
-    battery: float | None
-    battery_temperature_c: float | None
-    board_temperature_c: float | None
-    errors: tuple[str, ...]
-
-
 class ThetaClient:
     """Commands to the camera over one persistent connection; safe to use from several threads.
 
@@ -72,8 +57,8 @@ class ThetaClient:
 
     Example:
         >>> client = ThetaClient("http://192.168.1.1", ThetaConfig())       # doctest: +SKIP
-        >>> client.info()["model"], client.state().battery                  # doctest: +SKIP
-        ('RICOH THETA Z1', 0.83)
+        >>> client.info()["model"]                                          # doctest: +SKIP
+        'RICOH THETA Z1'
     """
 
     def __init__(
@@ -109,18 +94,29 @@ class ThetaClient:
         """Return model, serial number and firmware (``GET /osc/info``)."""
         return self._call("GET", "/osc/info", None)
 
-    def state(self) -> ThetaState:
-        """Return battery, temperatures and error codes (``POST /osc/state``)."""
-        state = self._call("POST", "/osc/state", {}).get("state")
+    def health(self) -> Diagnosis:
+        """Ask for battery, temperatures and errors (``POST /osc/state``), which may take seconds."""
+        try:
+            state = self._call("POST", "/osc/state", {}).get("state")
+        except CameraError as error:
+            return Diagnosis("health", Level.WARN, str(error))
         state = state if isinstance(state, dict) else {}
+        battery, board_c = _number(state, "batteryLevel"), _number(state, "_boardTemp")
         errors = state.get("_cameraError")
         errors = errors if isinstance(errors, list) else [errors] if errors else []
-        return ThetaState(
-            battery=_number(state, "batteryLevel"),
-            battery_temperature_c=_number(state, "_batteryTemp"),
-            board_temperature_c=_number(state, "_boardTemp"),
-            errors=tuple(str(error)[:_MOST_TEXT] for error in errors[:20]),
-        )
+        low, hot = battery is not None and battery < _BATTERY_LOW, board_c is not None and board_c >= _BOARD_HOT_C
+        text = [
+            *(["battery is low: charge it"] if low else []),
+            *(["the camera is hot: switch it off to cool down"] if hot else []),
+            *(str(error)[:_MOST_TEXT] for error in errors[:20]),
+        ]
+        values = {
+            "battery": battery,
+            "battery_temperature_c": _number(state, "_batteryTemp"),
+            "board_temperature_c": board_c,
+        }
+        level = Level.ERROR if errors else Level.WARN if low or hot else Level.OK
+        return Diagnosis("health", level, ", ".join(text) or "no faults", values)
 
     def execute(self, name: str, parameters: Mapping[str, Any] | None = None) -> dict[str, Any]:
         """Run a command and return its results."""

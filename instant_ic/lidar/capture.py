@@ -9,7 +9,9 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
-LINK_NULL, LINK_ETHERNET, LINK_RAW, LINK_LINUX_SLL, LINK_LINUX_SLL2 = 0, 1, 101, 113, 276
+_ETHERNET = 1
+_IP_OFFSET = {0: 4, 101: 0, 113: 16, 276: 20}
+"""Bytes before the IP header by link type: BSD loopback, raw IP, Linux cooked 1 and 2."""
 
 _PCAP_MAGIC = {
     b"\xd4\xc3\xb2\xa1": ("<", 1000),
@@ -41,7 +43,7 @@ class CaptureReader:
         >>> reader = CaptureReader("recording.pcap")        # doctest: +SKIP
         >>> for stamp_ns, port, payload in reader: ...      # doctest: +SKIP
         >>> reader.skipped                                  # doctest: +SKIP
-        Counter({'not IP': 1, 'cut record': 1})
+        Counter({'not IPv4': 1, 'cut record': 1})
 
     Attributes:
         datagrams: UDP payloads returned.
@@ -154,37 +156,24 @@ def _tick_ns(data: bytes, at: int, end: int, order: str) -> float:
 
 def _udp(data: bytes, start: int, end: int, link: int) -> tuple[int, int, int] | str:
     """Return destination port, start and end of a frame's UDP payload, or the reason why it has none."""
-    if link == LINK_ETHERNET:
-        at = start + 12
-        while end - at >= 4 and data[at : at + 2] in (b"\x81\x00", b"\x88\xa8"):
+    at = start + _IP_OFFSET.get(link, 12)
+    if link == _ETHERNET:
+        while end - at >= 4 and data[at : at + 2] in (b"\x81\x00", b"\x88\xa8"):  # VLAN tags
             at += 4
-        if data[at : at + 2] not in (b"\x08\x00", b"\x86\xdd"):
-            return "not IP"
+        if data[at : at + 2] != b"\x08\x00":
+            return "not IPv4"
         at += 2
-    elif link == LINK_RAW:
-        at = start
-    elif link == LINK_NULL:
-        at = start + 4
-    elif link == LINK_LINUX_SLL:
-        at = start + 16
-    elif link == LINK_LINUX_SLL2:
-        at = start + 20
-    else:
+    elif link not in _IP_OFFSET:
         return f"unknown link type {link}"
     if at + 20 > end:
         return "cut frame"
-    version = data[at] >> 4
-    if version == 4:
-        protocol, header = data[at + 9], 4 * (data[at] & 0x0F)
-        if (data[at + 6] & 0x3F) | data[at + 7]:
-            return "IP fragment"
-    elif version == 6:
-        protocol, header = data[at + 6], 40
-    else:
-        return "not IP"
-    if protocol != 17:
+    if data[at] >> 4 != 4:
+        return "not IPv4"
+    if (data[at + 6] & 0x3F) | data[at + 7]:
+        return "IP fragment"
+    if data[at + 9] != 17:
         return "not UDP"
-    udp = at + header
+    udp = at + 4 * (data[at] & 0x0F)
     if udp + 8 > end:
         return "cut frame"
     length = data[udp + 4] << 8 | data[udp + 5]

@@ -9,6 +9,7 @@ from instant_ic.camera.config import ThetaConfig
 from instant_ic.camera.loop import CameraLoop
 from instant_ic.camera.source import Camera, CameraError, Frame
 from instant_ic.camera.theta import NEVER, ThetaCamera, ThetaClient, ThetaError
+from instant_ic.util.diagnosis import Level
 from instant_ic.util.reconnect import Backoff
 
 FRAMES = [jpeg(value) for value in (40, 80, 120, 160)]
@@ -136,11 +137,13 @@ def test_refused_command_gives_the_cameras_words() -> None:
 def test_state_with_errors() -> None:
     with FakeTheta() as theta:
         client = ThetaClient(theta.url, CONFIG)
-        state = client.state()
-        assert (state.battery, state.battery_temperature_c, state.board_temperature_c) == (0.83, 30.0, 41.0)
+        found = client.health()
+        assert (found.level, found.text) == (Level.OK, "no faults")
+        assert found.values == {"battery": 0.83, "battery_temperature_c": 30.0, "board_temperature_c": 41.0}
         theta.behaviour.state = {"_cameraError": ["HIGH_TEMPERATURE"]}
-        assert client.state().errors == ("HIGH_TEMPERATURE",)
-        assert client.state().battery is None
+        found = client.health()
+        assert (found.level, found.text) == (Level.ERROR, "HIGH_TEMPERATURE")
+        assert found.values["battery"] is None
 
 
 def test_frame_that_stalls_in_the_middle_is_never_given_out() -> None:

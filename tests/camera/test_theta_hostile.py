@@ -154,8 +154,8 @@ def test_reply_that_is_no_object_is_an_error(body: bytes) -> None:
 )
 def test_state_of_another_shape_is_unknown(state: Any) -> None:
     with Stranger(reply(json.dumps({"state": state}).encode())) as camera:
-        found = ThetaClient(camera.url, PATIENT).state()
-    assert (found.battery, found.board_temperature_c) == (None, None)
+        found = ThetaClient(camera.url, PATIENT).health().values
+    assert (found["battery"], found["board_temperature_c"]) == (None, None)
 
 
 def test_image_that_declares_more_pixels_than_a_camera_has_is_dropped() -> None:

@@ -67,7 +67,7 @@ def test_what_is_no_datagram_is_counted_by_reason(tmp_path: Path) -> None:
     assert reader.skipped == {
         "not UDP": 1,
         "IP fragment": 1,
-        "not IP": 2,
+        "not IPv4": 2,
         "cut datagram": 1,
         "cut record": 1,
     }
@@ -104,4 +104,4 @@ def test_malformed_capture_of_a_real_sensor() -> None:
     reader = CaptureReader(path)
     sizes = [len(datagram.payload) for datagram in reader]
     assert (sizes.count(1206), sizes.count(512)) == (41, 36)
-    assert reader.skipped == {"not IP": 1, "cut record": 1}
+    assert reader.skipped == {"not IPv4": 1, "cut record": 1}

@@ -81,7 +81,7 @@ def test_capture_gives_points_packets_scans_and_the_mount(capture: Path) -> None
     mount = bus.last("/tf_static").transforms[0]
     assert (mount.header.frame_id, mount.child_frame_id) == ("base_link", "velodyne")
     assert transform_matrix(mount)[:3, 3].tolist() == [0.0, 0.0, 0.6]
-    assert node.diagnoses()["capture"][:2] == (WARN, "303 datagrams played; left out: 1 x not IP")
+    assert node.diagnoses()["capture"][:2] == (WARN, "303 datagrams played; left out: 1 x not IPv4")
     bus.advance(0.6)
     text = "receiving packets; 1 incomplete revolutions gave no scan"
     assert node.diagnoses()["packets"][:2] == (OK, text)
