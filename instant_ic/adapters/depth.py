@@ -14,7 +14,7 @@ from instant_ic.msg import Keyframe, cloud_array, cloud_points, header, image_me
 
 
 def held_image(message: Any) -> HeldImage:
-    """Frame and stamp of an Image or CompressedImage."""
+    """Return frame and stamp of an Image or CompressedImage."""
     return HeldImage(message.header.frame_id, stamp_ns(message))
 
 

@@ -24,7 +24,7 @@ from instant_ic.vspace.worker import EncodedView, KeyframeArrays, SpaceWorker, V
 
 
 def decode_keyframe(keyframe: Any) -> KeyframeArrays:
-    """Arguments of ``VirtualSpace.prepare``.
+    """Return the arguments of ``VirtualSpace.prepare``.
 
     Raises:
         KeyframeError: the keyframe is marked unfit, or cannot be decoded.

@@ -105,7 +105,7 @@ class DepthChain:
         return self._trigger.revolution(revolution.middle_ns)
 
     def estimate(self, raw: NDArray[np.float32] | None, image: HeldImage) -> DepthResult:
-        """Depth of an image; ``raw``: (H, W) the network's, if the source needs it."""
+        """Estimate the depth of an image; ``raw``: the network's, (H, W), if the source needs it."""
         self._last_ns = image.stamp_ns
         return self.metric.estimate(raw, image.frame, image.stamp_ns)
 
@@ -113,7 +113,7 @@ class DepthChain:
         self._diagnose("scale", Level.OK if result.ok else Level.WARN, result.message, **result.figures())
 
     def keyframe_pose(self, result: DepthResult, image: HeldImage) -> Matrix | None:
-        """map_from_camera of a new keyframe; None if the image of this depth becomes none."""
+        """Return map_from_camera of a new keyframe; None if this image does not become one."""
         if image.stamp_ns not in self.inputs.images:
             return self._diagnose("keyframe", Level.WARN, "the image that this depth belongs to did not arrive")
         try:

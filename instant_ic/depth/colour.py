@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 def depth_picture(
     depth: NDArray[np.floating], near: float | None = None, far: float | None = None
 ) -> NDArray[np.uint8]:
-    """Colours depth, near bright and far dark on a logarithmic scale, unknown black; (H, W) -> (H, W, 3) RGB.
+    """Colour depth (H, W) on a logarithmic scale, near bright, far dark, unknown black; return RGB, (H, W, 3).
 
     ``near`` and ``far`` are the ends of the scale; by default the 1 % and 99 % quantiles of the known depth.
     """

@@ -17,7 +17,7 @@ _MOST_M = 40.0
 def prior_channels(
     depth_m: Floats, sigma: Floats, ranges_m: Floats, up: Floats, camera_height_m: float | None, network_m: Floats
 ) -> NDArray[np.float32]:
-    """Channels (6, H, W) that a completion network takes beside the image.
+    """Build the channels (6, H, W) that a completion network takes beside the image.
 
     Args:
         depth_m: (H, W) fused radial metres, 0 = unknown.

@@ -40,7 +40,7 @@ def load_picture(path: str | Path) -> NDArray[np.uint8]:
 
 
 def load_depth(path: str | Path, png_unit_m: float = 1e-3) -> NDArray[np.float32]:
-    """Depth (H, W) float32 in metres, 0 = unknown: also what is not finite, not above 0, or 10 km and farther.
+    """Load depth in metres, (H, W) float32. Values that are not finite, not above 0 or above 10 km become 0, unknown.
 
     Args:
         path: the file.

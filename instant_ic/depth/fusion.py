@@ -17,7 +17,7 @@ the height of a wall rather than along it."""
 
 
 def ceiling_height(depth_m: Floats, rise: Floats, least_m: float = 0.3) -> float | None:
-    """Height over the camera, metres, at which most of the upper part of a depth image lies.
+    """Return the height over the camera, in metres, at which most of the upper part of a depth image lies.
 
     Args:
         depth_m: (H, W) radial metres, 0 = unknown.
@@ -59,7 +59,7 @@ class Corrected:
 
 
 def correct(network_m: Floats, measured_m: Floats) -> Corrected:
-    """Corrects scaled network depth (H, W) by ranges (H, W) at some pixels, 0 elsewhere: a smooth field of factors.
+    """Correct scaled network depth (H, W) by a smooth field of factors from ranges (H, W), 0 where there is none.
 
     The field is the weighted mean of the log ratios over a Gaussian around each pixel, 1 far from any point; the
     second time what is far from the first counts little.
@@ -73,7 +73,7 @@ def correct(network_m: Floats, measured_m: Floats) -> Corrected:
     pad = int(3 * sigma[0]) + 1
 
     def blurred(values: Floats) -> NDArray[np.float32]:
-        """At a quarter of the resolution."""
+        """Blur at a quarter of the resolution."""
         coarse = cv2.resize(values.astype(np.float32), small, interpolation=cv2.INTER_AREA)
         wide = cv2.copyMakeBorder(coarse, 0, 0, pad, pad, cv2.BORDER_WRAP)
         return cv2.GaussianBlur(wide, (0, 0), sigma[0], None, sigma[1], cv2.BORDER_REFLECT)[:, pad:-pad]
@@ -99,7 +99,7 @@ def correct(network_m: Floats, measured_m: Floats) -> Corrected:
 
 
 def likely_ceiling(seen_m: float, network: Corrected, usual_m: float) -> float:
-    """Height of a ceiling over the camera in metres, from the network's depth and the usual height.
+    """Estimate a ceiling's height over the camera in metres from the network's depth and the usual height.
 
     Ceilings vary by a fifth around the usual one; a network's is off by about as much as it is at the points, and by
     a third of the share that is plainly wrong there (measured on simulated rooms).

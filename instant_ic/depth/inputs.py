@@ -113,5 +113,5 @@ class DepthRequests:
         return True
 
     def answered(self) -> None:
-        """Depth has arrived. A slow network answers after the repetition, so any depth is the answer."""
+        """Note that depth has arrived; any depth is the answer, because a slow network answers after the repetition."""
         self.since_ns = None

@@ -85,7 +85,7 @@ _LEAST_SIGMA, _SIGMA_SPAN = 0.002, 500.0
 
 
 def encode_sigma(sigma: NDArray[np.floating]) -> NDArray[np.uint8]:
-    """Relative standard deviations (H, W) as bytes (H, W), a step 2.5 %; 0 where not finite (see Keyframe.msg)."""
+    """Encode relative standard deviations (H, W) as bytes, 2.5 % a step; 0 where not finite (see Keyframe.msg)."""
     known = np.isfinite(sigma)
     share = np.log(np.maximum(np.where(known, sigma, 1.0), _LEAST_SIGMA) / _LEAST_SIGMA) / math.log(_SIGMA_SPAN)
     return np.where(known, 1 + np.rint(254 * np.minimum(share, 1.0)), 0).astype(np.uint8)

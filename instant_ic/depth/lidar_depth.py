@@ -275,7 +275,7 @@ class LidarStructure:
         return np.asarray(points[inside], np.float64)
 
     def _problem(self, z: Floats, range_m: Floats, columns: NDArray[np.intp], width: int, floor: float | None) -> str:
-        """Reason for not trusting the structure; empty if it is trusted."""
+        """Return the reason for not trusting the structure; empty if it is trusted."""
         if problem := azimuth_problem(columns, width):
             return problem
         under = 0.0 if floor is None else float((z < -floor - 0.15 - 0.02 * range_m).mean())

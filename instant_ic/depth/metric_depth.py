@@ -72,7 +72,7 @@ class MetricDepth:
             self.mapper = LocalMapper(self.transforms, config.mapping)
 
     def estimate(self, raw: NDArray[np.float32] | None, camera: str, stamp_ns: int) -> DepthResult:
-        """Depth of an image; if something is missing the result is not ok, and its message says what.
+        """Estimate the depth of an image; if something is missing the result is not ok, and its message says what.
 
         Args:
             raw: (H, W) the network's depth; None for the source ``lidar``.
@@ -97,7 +97,7 @@ class MetricDepth:
         return without_body(result, up, height_m, config.body_elevation_deg)
 
     def camera_stance(self, camera: str, stamp_ns: int) -> tuple[NDArray[np.float64], float]:
-        """Up direction in the camera's frame (odometry is level), and the camera's height above the ground.
+        """Return the up direction in the camera's frame (odometry is level) and the camera's height over the ground.
 
         Raises:
             TransformError: the poses are not known.
@@ -107,7 +107,7 @@ class MetricDepth:
         return np.array(odom_from_camera[2, :3]), float(base_from_camera[2, 3])
 
     def points_in_camera(self, camera: str, stamp_ns: int) -> NDArray[np.float64] | None:
-        """(N, 3) motion-compensated points in the camera's frame at ``stamp_ns``; None without a revolution near it.
+        """Return motion-compensated points at ``stamp_ns`` in the camera's frame, (N, 3); None without a revolution.
 
         Raises:
             TransformError: the poses are not known.
@@ -123,8 +123,9 @@ class MetricDepth:
         return points_at(revolution.xyz(), revolution.time_s, revolution.stamp_ns, camera_from_lidar)
 
     def map_from_camera(self, camera: str, stamp_ns: int) -> Matrix:
-        """Odometry and its correction at the image's time: tracks slip in a turn, so one second later the correction is
-        another by degrees.
+        """Return the camera's pose from odometry and its correction at the image's time.
+
+        Tracks slip in a turn: one second later the correction differs by degrees.
 
         Raises:
             TransformError: the poses are not known.

@@ -87,7 +87,7 @@ def depth_metrics(
 
 
 def _median(values: Floats, weights: Floats) -> float:
-    """Weighted median: mean of the values where the weights below are just under and just over one half."""
+    """Return the weighted median: the mean of the values at which half of the weight is just not and just reached."""
     order = np.argsort(values)
     total = np.cumsum(weights[order])
     half = 0.5 * total[-1]
@@ -97,7 +97,7 @@ def _median(values: Floats, weights: Floats) -> float:
 
 
 def mean_metrics(each: Sequence[DepthMetrics]) -> DepthMetrics:
-    """Mean over maps (every map counts the same); ``pixels`` is the sum.
+    """Return the mean over maps (every map counts the same); ``pixels`` is the sum.
 
     Raises:
         ValueError: nothing to average.
@@ -110,7 +110,7 @@ def mean_metrics(each: Sequence[DepthMetrics]) -> DepthMetrics:
 
 
 def solid_angle_weights(height: int) -> NDArray[np.float32]:
-    """Weight of each row of an equirect image, (height,), mean 1.
+    """Return the weight of each row of an equirect image, (height,), mean 1.
 
     The solid angle of a pixel is proportional to the sine difference of its edges' elevations. Without it the poles,
     which fill many pixels and little space, rule a mean over pixels.

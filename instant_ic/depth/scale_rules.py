@@ -51,7 +51,7 @@ def max_ratio_scale(depth: Floats, range_m: Floats, confidence: float = 0.995) -
 
 
 def log_ratios(depth: Floats, range_m: Floats) -> NDArray[np.float64]:
-    """log(range / depth) of pairs of the same direction, both (N,); pairs that are not positive are left out.
+    """Return log(range / depth) of pairs of one direction, (N,) each; pairs that are not positive are left out.
 
     Raises:
         ScaleError: fewer than ``MIN_VALUES`` usable pairs.
@@ -94,7 +94,7 @@ def consensus_scale(depth: Floats, range_m: Floats, tolerance: float = 0.15) -> 
 
 
 def _fullest(values: NDArray[np.float64], width: float) -> tuple[int, int]:
-    """Bounds of the window of a width that holds the most of sorted values (N,), N >= 1."""
+    """Return the bounds of the window of this width that holds most of the sorted values (N,), N >= 1."""
     ends = np.searchsorted(values, values + width, side="right")
     first = int(np.argmax(ends - np.arange(len(values))))
     return first, int(ends[first])

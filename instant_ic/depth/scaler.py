@@ -128,7 +128,7 @@ class DepthScaler:
         return ScaleFit(False, 1.0, given, 0.0, float("inf"), 0, message)
 
     def as_estimated(self, depth: Floats) -> ScaleFit:
-        """Depth (H, W) in the metres of a ``metric`` model, compared with nothing: ok, and the message says so."""
+        """Return depth (H, W) in the metres of a ``metric`` model as a fit that is ok, although it is not compared."""
         message = "metres as estimated: the LiDAR was not asked (method as_estimated)"
         return ScaleFit(True, 1.0, self._clean(depth), 0.0, self.config.assumed_sigma, 0, message)
 
@@ -184,7 +184,7 @@ class DepthScaler:
     def _field(
         self, metres: Floats, rows: NDArray[np.intp], columns: NDArray[np.intp], range_m: Floats
     ) -> NDArray[np.float32]:
-        """Factor (H, W) of each direction by the points near the scale; towards the poles it goes to 1."""
+        """Return the factor of each direction, (H, W), from the points near the scale; it goes to 1 at the poles."""
         height, width = metres.shape
         ratio = np.log(range_m / metres[rows, columns])
         near = np.abs(ratio) <= _SECTOR_REACH
@@ -195,7 +195,7 @@ class DepthScaler:
         return np.exp(np.cos(elevation)[:, None] * of_columns[None, :]).astype(np.float32)
 
     def _problem(self, scale: float, quality: float, scaled: Floats, range_m: Floats) -> str:
-        """Why the fit is not to be trusted; empty where it is."""
+        """Return the reason for not trusting the fit; empty if it is trusted."""
         config = self.config
         if not config.min_scale <= scale <= config.max_scale:
             return f"scale {scale:.3g} is outside {config.min_scale} to {config.max_scale}"

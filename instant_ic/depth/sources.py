@@ -216,7 +216,7 @@ class DepthSource:
         )  # fmt: skip
 
     def refuse(self, raw: Floats | None, message: str, size: tuple[int, int] = (256, 512)) -> DepthResult:
-        """Unfit result for an image without points: ``raw`` if that is in metres, else all unknown."""
+        """Return an unfit result for an image without points: ``raw`` if that is in metres, else all unknown."""
         if raw is not None:
             return replace(_of_fit(self.scaler.refuse(raw, message)), source=self.config.source)
         fit = ScaleFit(False, 1.0, np.zeros(size, np.float32), 0.0, float("inf"), 0, message)
@@ -238,7 +238,7 @@ class DepthSource:
         self, points: Floats, up: Floats, camera_height_m: float | None, size: tuple[int, int],
         local: LocalView | None, top: float | None,
     ) -> _Built:  # fmt: skip
-        """Depth without a network: the local model first, then this revolution's structure; ``top``: a ceiling."""
+        """Build depth without a network: the local model, then this revolution's structure; ``top``: a ceiling."""
         seen = None if local is None else local.ceiling_m
         structure = self.structure.estimate(points, up, camera_height_m, size, top if seen is None else seen)
         depth, sigma, free = structure.depth_m, structure.sigma, np.zeros(size, np.float32)
@@ -340,7 +340,7 @@ def without_body(result: DepthResult, up: Floats, camera_height_m: float | None,
 
 
 def agreement(depth_m: Floats, points: Floats, config: ScalerConfig) -> float:
-    """Share of points (N, 3) within ``AGREEMENT`` of the depth (H, W) at their pixels."""
+    """Return the share of points (N, 3) within ``AGREEMENT`` of the depth (H, W) at their pixels."""
     points = points[np.isfinite(points).all(axis=1)]
     rows, columns, range_m = nearest_points(points, depth_m.shape[1], depth_m.shape[0])
     inside = (range_m >= config.min_range_m) & (range_m <= config.max_range_m)

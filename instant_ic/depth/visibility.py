@@ -14,12 +14,12 @@ _LEAST_AZIMUTH_DEG = 90.0
 
 
 def pixels_of(points: Floats, width: int, height: int) -> tuple[Indices, Indices, Floats]:
-    """Rows, columns and ranges in metres, each (N,), of points (N, 3) in the camera's frame."""
+    """Return rows, columns and ranges in metres, (N,) each, of points (N, 3) in the camera's frame."""
     return *nearest_pixels(points, width, height), np.linalg.norm(points, axis=-1)
 
 
 def nearest_points(points: Floats, width: int, height: int) -> tuple[Indices, Indices, Floats]:
-    """Rows, columns and ranges of the nearest point in each pixel that has one.
+    """Return rows, columns and ranges of the nearest point in each pixel that has one.
 
     Of two points in one pixel the nearer is the one that the camera sees.
     """
@@ -55,7 +55,7 @@ def hidden(points: Floats, margin: float = 0.25, cell_deg: float = CELL_DEG) -> 
 
 
 def azimuth_problem(columns: Indices, width: int) -> str:
-    """Why points in these columns (N,) of an image cover too little azimuth; empty where they cover enough."""
+    """Return an error text if points in these columns (N,) cover too little azimuth; else an empty one."""
     covered = len(np.unique(columns * 120 // width)) * 3.0
     if covered >= _LEAST_AZIMUTH_DEG:
         return ""

@@ -232,7 +232,7 @@ class Vlp16:
         return [data[i * length : (i + 1) * length] for i in range(count)]
 
     def position_packet(self, time_s: float) -> bytes:
-        """Position packet of a sensor whose clock is locked to GPS time."""
+        """Make the position packet of a sensor whose clock is locked to GPS time."""
         now_ns = self._epoch_ns(time_s)
         moment = datetime.fromtimestamp(now_ns // 1_000_000_000, UTC)
         body = f"GPRMC,{moment:%H%M%S},A,0000.0000,N,00000.0000,E,000.0,000.0,{moment:%d%m%y},000.0,E"

@@ -47,7 +47,7 @@ CONFIG = AgreementConfig()
 
 
 def moved(priors: Sequence[PanoramaPrior]) -> list[NDArray[np.bool_]]:
-    """Pixels of each keyframe (newest first, all of one size) that show moved or moving objects, (h, w) each.
+    """Mark the pixels of keyframes (newest first, of one size) that show moved or moving objects, (h, w) each.
 
     Each keyframe that knows says whether there is a surface at a pixel's place or whether it has looked through it; the
     majority counts, and where there is none the newest: of two keyframes the newer wins. What of the newest another's
@@ -75,7 +75,7 @@ def moved(priors: Sequence[PanoramaPrior]) -> list[NDArray[np.bool_]]:
 def _looks_different(
     mask: NDArray[np.bool_], prior: PanoramaPrior, others: Sequence[PanoramaPrior]
 ) -> NDArray[np.bool_]:
-    """Those of a keyframe's pixels (h, w) whose places no other keyframe shows in the same colour."""
+    """Mark the pixels of a keyframe (h, w) whose places no other keyframe shows in the same colour."""
     left = mask.copy()
     directions = equirect_directions(mask.shape[1], mask.shape[0])[mask]
     own, pose = prior.colours(directions), prior.map_from_camera.astype(np.float32)
@@ -98,12 +98,12 @@ def _opened(mask: NDArray[np.bool_], step: int) -> NDArray[np.bool_]:
 
 
 def disagreement(first: PanoramaPrior, second: PanoramaPrior) -> float:
-    """Share of a distance by which the depths of two keyframes may differ and still be of one surface."""
+    """Return the largest relative difference of two keyframes' depths that still belong to one surface."""
     return max(0.15, 3 * math.hypot(first.relative_sigma, second.relative_sigma))
 
 
 def exposure_gains(priors: Sequence[PanoramaPrior]) -> Floats:
-    """Factors that bring each keyframe's colours to the newest's (the first), (K, 3).
+    """Return the factors that bring each keyframe's colours to those of the newest (the first), (K, 3).
 
     A keyframe that has too little in common with the newest is fitted to those between them.
     """
@@ -121,7 +121,7 @@ def exposure_gains(priors: Sequence[PanoramaPrior]) -> Floats:
 
 
 def exposure_gain(newest: PanoramaPrior, older: PanoramaPrior) -> Floats | None:
-    """Factors (3,) that bring an older keyframe's colours to the newest's, from places that both have seen.
+    """Fit factors (3,) that bring an older keyframe's colours to the newest's at places that both have seen.
 
     The middle of the shortest interval that holds half of the ratios, a colour (the shorth): what has changed between
     the two, such as a lamp or a shadow, does not move it as long as it is less than half. Where no factor differs from

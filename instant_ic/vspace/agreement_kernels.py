@@ -15,7 +15,7 @@ FOR, AGAINST, NO_OPINION = 1, 2, 0
 
 @njit(**_OPTIONS)
 def panorama_pixel(x, y, z, height, width):  # type: ignore[no-untyped-def]
-    """Upper left pixel (row, column) of a point of the camera frame, and its distance."""
+    """Return the upper left pixel (row, column) of a point of the camera's frame, and its distance."""
     flat = math.sqrt(x * x + y * y)
     u = (math.pi - math.atan2(y, x)) * (width / (2 * math.pi)) - 0.5
     v = (math.pi / 2 - math.atan2(z, flat)) * (height / math.pi) - 0.5
@@ -49,7 +49,7 @@ def opinion(x, y, z, inverse, sure, room):  # type: ignore[no-untyped-def]
 
 @njit(**_OPTIONS)
 def outvoted(directions, inverse, sure, map_from_camera, camera_from_map, room, own, step, out):  # type: ignore[no-untyped-def]
-    """Pixels of keyframe ``own`` through which most of the keyframes with an opinion have looked.
+    """Mark the pixels of keyframe ``own`` through which most of the keyframes with an opinion have looked.
 
     Args:
         directions: unit vectors of the panorama's pixels in the camera's frame, (h, w, 3).

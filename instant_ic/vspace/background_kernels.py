@@ -17,7 +17,7 @@ SAME_THING = np.float32(2)
 
 @njit(**_OPTIONS)
 def in_front(inverse, depth_edge, level, reach, steps):  # type: ignore[no-untyped-def]
-    """Distance of pixels of nearer surfaces from a depth edge.
+    """Return the distance of pixels of nearer surfaces from a depth edge.
 
     From the near side of each edge the near surface is followed, as long as it stays nearer than half way between the
     two sides of that edge.
@@ -95,8 +95,12 @@ def render_quads(  # type: ignore[no-untyped-def]
 def colour_pixels(  # type: ignore[no-untyped-def]
     rgb, shares, camera_from_map, origin, directions, wanted, depth, colour, share
 ):
-    """Colours (P, 3) of a panorama (h, w, 3), bilinear, at places ``depth`` (P,) along rays where ``wanted`` (P,);
-    likewise ``share`` (P,) in 0..1 of ``shares`` (h, w) uint8.
+    """Write the colours (P, 3) and weights ``share`` (P,), 0 to 1, of a panorama where ``wanted`` (P,), bilinear.
+
+    Args:
+        rgb: the panorama, (h, w, 3) uint8.
+        shares: its weights, 0 to 255, (h, w) uint8.
+        depth: places along the rays, (P,).
     """
     height, width = rgb.shape[:2]
     one = np.float32(1)

@@ -67,7 +67,7 @@ def trials(shown: KeyframeSet) -> tuple[WarpTrial, ...]:
 
 
 def gain_db(trials: Sequence[WarpTrial], renderings: Sequence[Rendering]) -> float:
-    """PSNR of the field's renderings above the warp's over all judged pixels that both render; NaN without any."""
+    """Return by how much the field's PSNR exceeds the warp's on pixels that both render; NaN without any."""
     warp = field = 0.0
     for trial, (colour, _, confidence) in zip(trials, renderings, strict=True):
         both = np.isfinite(trial.warp_error) & (confidence > 0)

@@ -12,7 +12,7 @@ from instant_ic.vspace.nerf.kernels import _OPTIONS
 
 @njit(**_OPTIONS)
 def farthest_walls(upright, wall, share, far):  # type: ignore[no-untyped-def]
-    """Distance of the farthest walls around a keyframe, by direction.
+    """Return the distance of the farthest walls around a keyframe, by direction.
 
     Args:
         upright: inverse of the horizontal distance, (h, w); wall: (h, w) where that is of anything upright.
@@ -34,7 +34,7 @@ def farthest_walls(upright, wall, share, far):  # type: ignore[no-untyped-def]
 def walls_behind(  # type: ignore[no-untyped-def]
     upright, wall, hole, far, look, span, same, behind, slope_prior, farthest, found
 ):
-    """Walls behind near surfaces, upright.
+    """Continue upright walls behind near surfaces.
 
     What is seen above a near surface goes on behind it. Where nothing behind it is seen above it, the planes of the
     walls at its left and right go on; two of them meet in a corner.
@@ -84,7 +84,7 @@ def _alike(a, b, factor):  # type: ignore[no-untyped-def]
 
 @njit(**_OPTIONS)
 def _plane_beside(upright, far, u, row, hidden, side, span, same, behind, slope_prior, farthest):  # type: ignore[no-untyped-def]
-    """Inverse distance at column ``u`` of the plane beside what hides it there; 0 where there is none behind it."""
+    """Return the inverse distance at column ``u`` of the plane beside the surface that hides it; 0 without one."""
     width = far.shape[0]
     step = np.float32(2 * math.pi / width)
     front = hidden

@@ -10,7 +10,7 @@ from instant_ic.vspace.nerf.kernels import _OPTIONS
 
 
 def fill(values: NDArray[np.float32], weight: NDArray[np.float32]) -> NDArray[np.float32]:
-    """``values`` (H, W, C) with the pixels of ``weight`` (H, W) 0 filled from around; see ``prior.fill_holes``."""
+    """Fill the pixels of ``values`` (H, W, C) with ``weight`` (H, W) 0 from around; see ``prior.fill_holes``."""
     sizes = [weight.shape]
     while min(sizes[-1]) > 1:
         sizes.append(((sizes[-1][0] + 1) // 2, (sizes[-1][1] + 1) // 2))
@@ -23,7 +23,7 @@ def fill(values: NDArray[np.float32], weight: NDArray[np.float32]) -> NDArray[np
 
 @njit(**_OPTIONS)
 def pull_push(values, weight, sizes, levels):  # type: ignore[no-untyped-def]
-    """In place; ``levels`` holds weighted sums and weights of all levels, one after another, and comes as zeros."""
+    """Fill in place; ``levels``, zeros at first, takes the weighted sums and weights of all levels in turn."""
     channels = values.shape[2]
     height, width = weight.shape
     holes = 0

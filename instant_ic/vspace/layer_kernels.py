@@ -13,7 +13,7 @@ SAME_SURFACE = 0.1
 
 @njit(**_OPTIONS)
 def corner_values(inverse, torn):  # type: ignore[no-untyped-def]
-    """Inverse depth at the pixels' corners, (h + 1, w): the mean of the pixels around; at the poles, of the row."""
+    """Return the inverse depth at the pixels' corners, (h + 1, w): the mean around them, at the poles of the row."""
     height, width = inverse.shape
     corners = np.empty((height + 1, width), np.float32)
     for u in range(width):
@@ -28,7 +28,7 @@ def corner_values(inverse, torn):  # type: ignore[no-untyped-def]
 
 @njit(**_OPTIONS)
 def _apart(corners, directions, a, b, c, m):  # type: ignore[no-untyped-def]
-    """Error of the inverse depth at corner ``m`` of the plane through corners ``a``, ``b``, ``c``; each (row, column).
+    """Return the inverse depth's error at corner ``m`` of the plane through corners ``a``, ``b``, ``c`` (row, column).
 
     A plane's inverse depth is linear in the direction.
     """
@@ -51,7 +51,7 @@ def _apart(corners, directions, a, b, c, m):  # type: ignore[no-untyped-def]
 
 @njit(**_OPTIONS)
 def lattice_errors(corners, directions, alone, tile):  # type: ignore[no-untyped-def]
-    """Error that leaving out each corner makes, here or further down, (h + 1, w).
+    """Return the error that leaving out each corner makes, here or further down, (h + 1, w).
 
     A corner is the middle of the longest side of the two triangles that it splits. Of a square of side s the centre is
     split first, then the middles of the sides, then the centres of its quarters. So the error of a corner is at least
@@ -117,7 +117,7 @@ def _push(stack, n, cv, cu, av, au, bv, bu):  # type: ignore[no-untyped-def]
 
 @njit(**_OPTIONS)
 def _leaves(errors, alone, tile, limit, out):  # type: ignore[no-untyped-def]
-    """Triangles of the network as rows and columns of apex and long side, (T, 6) int32, into ``out``; their number.
+    """Write the triangles, rows and columns of apex and long side, (T, 6) int32, to ``out``; return their number.
 
     Triangles in pixels that are alone are left out. With ``out`` of no rows they are only counted.
     """
@@ -165,14 +165,14 @@ def count_triangles(errors, alone, shown, tile, limit):  # type: ignore[no-untyp
 
 @njit(**_OPTIONS)
 def _inner_slope(own, inner, shown):  # type: ignore[no-untyped-def]
-    """Change of the inverse depth to a pixel from the one on its inner side; 0 where that is another surface."""
+    """Return the change of inverse depth from the pixel on the inner side; 0 where that is another surface."""
     same = shown and abs(own - inner) <= SAME_SURFACE * min(own, inner)
     return own - inner if same else np.float32(0)
 
 
 @njit(**_OPTIONS)
 def _continued(inverse, shown, v, u, down, right):  # type: ignore[no-untyped-def]
-    """Inverse depth at a corner of a pixel, its surface continued; ``down``, ``right``: 0 or 1, which corner."""
+    """Return the inverse depth of a pixel's continued surface at its corner ``down``, ``right`` (0 or 1 each)."""
     height, width = inverse.shape
     own = inverse[v, u]
     side, above = (u + 1 - 2 * right) % width, min(max(v + 1 - 2 * down, 0), height - 1)
@@ -182,7 +182,7 @@ def _continued(inverse, shown, v, u, down, right):  # type: ignore[no-untyped-de
 
 @njit(**_OPTIONS)
 def _edge_value(inverse, shown, v, u, down, right):  # type: ignore[no-untyped-def]
-    """Inverse depth at a corner of a pixel on a depth edge: the mean of those around that show its surface."""
+    """Return the inverse depth at a corner of a pixel on a depth edge: the mean of its surface's pixels around."""
     height, width = inverse.shape
     own = _continued(inverse, shown, v, u, down, right)
     total, count = own, 1

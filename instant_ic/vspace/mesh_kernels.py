@@ -30,7 +30,7 @@ def shade(  # type: ignore[no-untyped-def]
     triangles, corner_uv, corner_rgb, texture, texel_per_m, texels, start, sizes, levels,
     origin, directions, range_m, face, pixel_rad, colour
 ):  # fmt: skip
-    """Colours where rays meet the mesh: texture (trilinear, by the pixel's footprint) or vertex colours.
+    """Shade the hits of rays by the texture (trilinear, by the pixel's footprint) or the corners' colours.
 
     Args:
         triangles ... texture: as in ``ColouredMesh``; texel_per_m ... levels: as in ``texel_pyramids``.

@@ -113,7 +113,7 @@ class MeshSpace(RayRenderer):
         self._check_place(depth_m, range_m, aside, width)
 
     def _fit_colours(self, theirs: Floats, ours: Floats) -> None:
-        """Factors of the mesh's colours from medians, as between keyframes; later keyframes go half the way."""
+        """Fit the factors of the mesh's colours by medians; later keyframes change them half the way."""
         usable = np.all((theirs > 0.05) & (theirs < 0.95) & (ours > 0.05) & (ours < 0.95), axis=1)
         if np.count_nonzero(usable) < _MIN_SAMPLES:
             return
@@ -121,7 +121,7 @@ class MeshSpace(RayRenderer):
         self._gain = fit if math.isnan(self._mse) else np.sqrt(self._gain * fit)
 
     def _check_place(self, depth_m: Floats, range_m: Floats, aside: NDArray[np.bool_], width: int) -> None:
-        """Warns where the keyframe's depth says that the mesh lies elsewhere."""
+        """Warn if the keyframe's depth shows that the mesh lies elsewhere."""
         height = width // 2
         rows = (np.arange(height) + 0.5) * (depth_m.shape[0] / height)
         columns = (np.arange(width) + 0.5) * (depth_m.shape[1] / width)
@@ -174,7 +174,7 @@ class MeshSpace(RayRenderer):
         return View(rgb, depth, confidence, projection, psnr_of_mse(mse))
 
     def _render_rays(self, rays: Rays) -> tuple[Floats, Floats, Floats]:
-        """Colours (P, 3) in 0..1, range (P,) with 0 where nothing is met, and confidence (P,)."""
+        """Render rays; return colours (P, 3), 0 to 1, range (P,), 0 where nothing is met, and confidence (P,)."""
         height, width = rays.shape
         turn = self._map_from_mesh[:3, :3].astype(np.float32)
         origin = ((rays.origin - self._map_from_mesh[:3, 3]) @ self._map_from_mesh[:3, :3]).astype(np.float32)
@@ -215,7 +215,7 @@ class MeshSpace(RayRenderer):
         return colour, np.where(face >= 0, range_m, 0).astype(np.float32), face
 
     def _fine(self, range_m: Floats, face: NDArray[np.int32], pixel_rad: float) -> NDArray[np.bool_]:
-        """Pixels (P,) that need several rays: at depth edges, and where triangles are finer than a pixel."""
+        """Mark pixels (P,) that need several rays: at depth edges, and where triangles are finer than a pixel."""
         edge = np.zeros(range_m.shape, bool)
         for axis in (0, 1):
             a, b = (range_m[1:], range_m[:-1]) if axis == 0 else (range_m[:, 1:], range_m[:, :-1])

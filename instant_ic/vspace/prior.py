@@ -110,7 +110,7 @@ class PanoramaPrior:
         return (self.content == ROOM).astype(np.uint8)
 
     def in_camera(self, points: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Points (N, 3) of the map in the camera's frame."""
+        """Transform points (N, 3) of the map to the camera's frame."""
         pose = self.map_from_camera.astype(np.float32)
         return np.asarray(np.einsum("ij,jk->ik", points - pose[:3, 3], pose[:3, :3]))
 
@@ -129,7 +129,7 @@ class PanoramaPrior:
         return np.asarray(known & (np.abs(self.inverse_depth[at] * distance - 1) < share))
 
     def colours(self, local: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Nearest pixels of the panorama in the direction of points (N, 3) of the camera's frame, (N, 3) in 0..255."""
+        """Return the panorama's nearest pixels, 0 to 255, (N, 3), towards points (N, 3) of the camera's frame."""
         height, width = self.rgb.shape[:2]
         return self.rgb[nearest_pixels(local, width, height)].astype(np.float32)
 
@@ -326,7 +326,7 @@ def _checked_sigma(
 
 
 def area_average(image: NDArray[np.uint8], height: int, width: int) -> NDArray[np.uint8]:
-    """Each target pixel is the mean over its area of the source, (H, W, C) → (height, width, C)."""
+    """Average an image over the area of each target pixel, (H, W, C) → (height, width, C)."""
     import cv2
 
     return np.asarray(cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA), np.uint8).reshape(
@@ -355,7 +355,7 @@ def fill_holes(
 
 
 def edge_quads(inverse_depth: NDArray[np.float32], ratio: float) -> NDArray[np.uint8]:
-    """1 for each quad (v, u)-(v + 1, u + 1) that crosses a depth edge; columns wrap, the last row has no quad below.
+    """Return 1 for each quad (v, u)-(v + 1, u + 1) across a depth edge; columns wrap, the last row has no quads.
 
     Two neighbours are an edge when their depths differ by more than ``ratio`` and neither side's slope of the inverse
     depth leads to the other: inverse depth is linear along a plane, however much the plane leans away. Where it leans

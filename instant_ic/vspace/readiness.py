@@ -81,7 +81,7 @@ def error_terms(
 
 
 def expected_psnr_db(terms: tuple[float, float], training_psnr_db: float, panorama_share: float) -> float:
-    """PSNR on the page from ``error_terms``; parts rendered by the field have at least its training error."""
+    """Return the PSNR on the page from ``error_terms``; the field's parts have at least its training error."""
     shift, unseen = terms
     training = 0.0 if panorama_share == 1 else (1 - panorama_share) * 10 ** (-training_psnr_db / 10)
     mse = BASE_MSE + SHIFT_GAIN * shift + UNSEEN_GAIN * unseen + training

@@ -131,12 +131,12 @@ def _turned(directions: Floats, turn: Floats) -> Floats:
 
 
 def perspective_rays(pose: NDArray[np.float64], width: int, height: int, fov_rad: float) -> Rays:
-    """Rays of a pinhole image along the camera's x axis."""
+    """Return the rays of a pinhole image along the camera's x axis."""
     return LensRays(pose, *_perspective(width, height, round(fov_rad, 6)), (height, width), 4)
 
 
 def equirect_rays(pose: NDArray[np.float64], width: int) -> Rays:
-    """Rays of a panorama, ``width`` × ``width / 2``."""
+    """Return the rays of a panorama, ``width`` × ``width / 2``."""
     pixels = _STRIDE_RAD / (2 * math.pi / width)
     stride = 4 if pixels >= 4 else 2 if pixels >= 2 else 1
     return LensRays(pose, *_equirect(width, width // 2), (width // 2, width), stride)

@@ -140,8 +140,9 @@ class PanoramaWarp:
         return View(rgb, depth, confidence)
 
     def render_rays(self, rays: Rays) -> tuple[Floats, Floats, Floats]:
-        """Colours (P, 3) in 0..1, depth along the ray (P,) and confidence (P,) of a perspective view's rays, as
-        ``field.Device.render_rays``; what has no confidence has no colour, unless nothing has any.
+        """Render the rays of a perspective view; return the same as ``field.Device.render_rays``.
+
+        Pixels without confidence have no colour, unless no pixel has any confidence.
         """
         from instant_ic.vspace import warp_kernels
 
@@ -168,7 +169,7 @@ class PanoramaWarp:
 
 
 def pinhole(rays: Rays) -> tuple[NDArray[np.float64], np.float32]:
-    """Pose (4, 4) of a perspective view, and the tangent of half its horizontal field of view, from its rays."""
+    """Return pose (4, 4) and tangent of half the horizontal field of view of a perspective view from its rays."""
     height, width = rays.shape
     some = rays.some(np.array([0, width - 1, (height - 1) * width, height * width - 1]))
     corners = (some.directions / some.axial[:, None]).reshape(2, 2, 3).astype(np.float64)

@@ -20,7 +20,7 @@ MAX_TAPS = 8
 
 @njit(**_OPTIONS)
 def beyond(x, y, z, half, tall):  # type: ignore[no-untyped-def]
-    """Planes of the view that a point lies beyond, one bit each; ``half``, ``tall``: tangents of half its angles."""
+    """Return the view's planes beyond which a point lies, as bits; ``half``, ``tall``: tangents of half its angles."""
     code = 1 if x < NEAR_M else 0
     code |= 2 if y > half * x else 0
     code |= 4 if y < -half * x else 0
@@ -31,7 +31,7 @@ def beyond(x, y, z, half, tall):  # type: ignore[no-untyped-def]
 
 @njit(**_OPTIONS)
 def place_vertices(inverse, directions, view_from_camera, half, aspect, vertices, outside):  # type: ignore[no-untyped-def]
-    """Corners of the mesh in the view's frame, and the planes of the view that they lie beyond.
+    """Transform the mesh's corners to the view's frame, and find the view's planes that they lie beyond.
 
     Args:
         inverse: inverse depth, (h, w); directions: unit vectors, (h, w, 3).
@@ -52,7 +52,7 @@ def place_vertices(inverse, directions, view_from_camera, half, aspect, vertices
 
 @njit(**_OPTIONS)
 def rasterize_triangle(a, b, c, clipped, mark, half, nearness, marks):  # type: ignore[no-untyped-def]
-    """One triangle into the z-buffer; corners are (x, y, z) in the view's frame, x forward.
+    """Rasterize a triangle into the z-buffer; corners are (x, y, z) in the view's frame, x forward.
 
     Edge functions are taken in homogeneous coordinates (Olano and Greer, 1997), so that nothing need be clipped:
     ``clipped`` only says that a corner lies behind the view, where it has no place in the image to bound by.
@@ -154,7 +154,7 @@ def render_mesh(  # type: ignore[no-untyped-def]
 
 @njit(**_OPTIONS)
 def _angle(y, x):  # type: ignore[no-untyped-def]
-    """``atan2`` in float32, within 1e-6 rad, in a third of the time: minimax polynomial of SLEEF's ``atanf_u35``."""
+    """Return ``atan2`` in float32, within 1e-6 rad, three times as fast: the polynomial of SLEEF's ``atanf_u35``."""
     ax, ay = abs(x), abs(y)
     t = min(ax, ay) / max(ax, ay, np.float32(1e-30))
     s = t * t
@@ -175,7 +175,7 @@ def _angle(y, x):  # type: ignore[no-untyped-def]
 
 @njit(**_OPTIONS)
 def panorama_places(camera_from_map, origin, directions, depth, height, width, places):  # type: ignore[no-untyped-def]
-    """Index coordinates (u, v) in a panorama (height × width) of points along rays, (P, 2); −1e9 at depth 0."""
+    """Return index coordinates (u, v) in a panorama (height × width) of points along rays, (P, 2); −1e9 at depth 0."""
     for n in range(depth.shape[0]):
         if depth[n] <= 0:
             places[n, 0] = places[n, 1] = np.float32(-1e9)
@@ -187,7 +187,7 @@ def panorama_places(camera_from_map, origin, directions, depth, height, width, p
 
 @njit(**_OPTIONS)
 def _step(places, n, other, width):  # type: ignore[no-untyped-def]
-    """From place ``n`` to place ``other``, over the seam where that is shorter."""
+    """Return the step from place ``n`` to place ``other``, over the seam where that is shorter."""
     du, dv = places[other, 0] - places[n, 0], places[other, 1] - places[n, 1]
     if du > 0.5 * width:
         du -= width
@@ -198,7 +198,7 @@ def _step(places, n, other, width):  # type: ignore[no-untyped-def]
 
 @njit(**_OPTIONS)
 def _shorter_step(places, n, before, after, width):  # type: ignore[no-untyped-def]
-    """Change of place over one pixel of the view; over a depth edge the side that jumps is left out."""
+    """Return the change of place over one pixel of the view; at a depth edge, on the side without a jump."""
     du, dv = _step(places, n, after, width) if after >= 0 else (np.float32(1e9), np.float32(0))
     eu, ev = _step(places, before, n, width) if before >= 0 else (np.float32(1e9), np.float32(0))
     return (du, dv) if du * du + dv * dv <= eu * eu + ev * ev else (eu, ev)

@@ -50,7 +50,7 @@ class Lattice:
 
     @classmethod
     def for_prior(cls, prior: PanoramaPrior, config: FieldConfig) -> Lattice:
-        """Coarsest cell: a sixteenth of the scene; finest: a panorama pixel at the median depth."""
+        """Fit the cells: the coarsest is a sixteenth of the scene, the finest a panorama pixel at the median depth."""
         extent = 2 * float(1.0 / np.quantile(prior.inverse_depth, 0.05))
         coarse = 16 / extent
         pixel = 2 * math.pi / prior.rgb.shape[1] * prior.median_depth_m
@@ -140,7 +140,7 @@ class TrainingScene:
 
 
 def ray_sources(keyframes: int, tiles: int, step: int) -> NDArray[np.int32]:
-    """Keyframe of each tile of a batch, (tiles,): half of them the newest, the rest the others.
+    """Return the keyframe of each tile of a batch, (tiles,): half of them the newest, the rest the others.
 
     Over the steps each keyframe looks everywhere: by a lattice of two irrational steps, so that no tile is left out
     for long.
@@ -202,7 +202,7 @@ class StackedPriors:
 
 
 def depth_trust(prior: PanoramaPrior) -> Floats:
-    """Weight of each pixel's depth, (h, w) float32: by the square of its uncertainty against the image's median."""
+    """Return the weight of each pixel's depth, (h, w) float32, by its squared uncertainty against the median."""
     with np.errstate(divide="ignore", invalid="ignore"):
         ratio = np.where(prior.sigma > prior.relative_sigma, prior.relative_sigma / prior.sigma, 1.0)
     return np.clip(ratio * ratio, LEAST_TRUST, 1.0).astype(np.float32)
@@ -255,14 +255,14 @@ class Device(Protocol):
         """
 
     def step(self, uniform: Floats, table_lr: float, network_lr: float) -> tuple[float, float]:
-        """One iteration on the rays sampled by ``uniform`` (N, 3) from the keyframes in turn (``ray_sources``).
+        """Train one iteration on the rays that ``uniform`` (N, 3) samples from the keyframes in turn (``ray_sources``).
 
         Returns:
             Mean squared colour error (0..1 units) and mean squared distance error (units of the band).
         """
 
     def render_rays(self, rays: Rays, panorama_share: float, depth_share: float) -> tuple[Floats, Floats, Floats]:
-        """Colours (P, 3) in 0..1, depth along the ray (P,) with 0 where nothing is met, confidence (P,).
+        """Render rays; return colours (P, 3), 0 to 1, depth (P,), 0 where nothing is met, and confidence (P,).
 
         Args:
             rays: P rays of the view.
@@ -288,7 +288,7 @@ class Schedule:
         return self.iteration >= self.config.iterations
 
     def rates(self) -> tuple[float, float]:
-        """Table's and network's rates of the present iteration."""
+        """Return the learning rates of table and network in the present iteration."""
         share = FINAL_LR_SHARE ** min(1.0, self.iteration / self.config.iterations)
         if self.refresh:
             share *= REFRESH_LR_SHARE
@@ -296,7 +296,7 @@ class Schedule:
 
 
 def sample_weights(config: TrainConfig) -> tuple[Floats, Floats]:
-    """Weights of a batch's samples in the loss, colour's and distance's, each (2 · rays,).
+    """Return the weights of a batch's samples in the losses of colour and distance, (2 · rays,) each.
 
     Samples in the band carry their ray's colour too, at less weight: a view from aside may meet the surface a little
     off its place.
@@ -309,15 +309,15 @@ def sample_weights(config: TrainConfig) -> tuple[Floats, Floats]:
 
 
 def volume_rays(config: TrainConfig) -> tuple[int, int]:
-    """Columns and rows of a batch's rays where geometry is a density: as many field queries as with a distance."""
+    """Return a batch's columns and rows for a density: it makes as many field queries as a distance."""
     return config.ray_columns // 2, config.ray_rows // 2
 
 
 def level_rates(levels: int) -> Floats:
-    """Learning rate of each level against the coarsest's, (levels,)."""
+    """Return the learning rate of each level relative to the coarsest, (levels,)."""
     return np.geomspace(1.0, FINE_LR_SHARE, levels).astype(np.float32)
 
 
 def adam_step_size(lr: float, step: int) -> float:
-    """Adam's step with both bias corrections in it; ``step`` counts from 1."""
+    """Return Adam's step size with both bias corrections; ``step`` counts from 1."""
     return lr * math.sqrt(1 - BETA2**step) / (1 - BETA1**step)

@@ -37,7 +37,7 @@ def no_marks(table: np.ndarray) -> np.ndarray:
 
 @njit(**_OPTIONS)
 def pixel_block(points, start, count, focus, pixel):  # type: ignore[no-untyped-def]
-    """Width of a panorama's pixel at ``points[start:start + count]``, metres, of the keyframe that saw it finest.
+    """Write the width in metres of a pixel of the keyframe that shows ``points[start:start + count]`` finest.
 
     ``focus``: places of the keyframes' cameras and radians of a pixel, (K, 4).
     """
@@ -86,7 +86,7 @@ def cells_block(points, start, count, origin, scale, size, pixel, entries, weigh
 
 @njit(**_OPTIONS)
 def of_point(corners, i):  # type: ignore[no-untyped-def]
-    """Eight corners' values (8, BLOCK) of one point, as a tuple."""
+    """Return the values (8, BLOCK) of one point's eight corners as a tuple."""
     return (
         corners[0, i], corners[1, i], corners[2, i], corners[3, i],
         corners[4, i], corners[5, i], corners[6, i], corners[7, i],
@@ -97,7 +97,7 @@ def of_point(corners, i):  # type: ignore[no-untyped-def]
 def encode_block(  # type: ignore[no-untyped-def]
     table, cells_per_m, origin, focus, points, start, count, entries, weights, x
 ):
-    """Trilinear features of ``points[start:start + count]`` into ``x`` (levels·features, BLOCK).
+    """Write the trilinear features of ``points[start:start + count]`` to ``x`` (levels·features, BLOCK).
 
     ``entries``, ``weights``: out, (levels, 8, BLOCK) for ``encode_backward_block``, of ``cells_block``; with (1, 8,
     BLOCK), where no gradient is wanted, one level is written over the other.
@@ -141,7 +141,7 @@ def encode_backward_block(table_grad, touched, entries, weights, count, dx):  # 
 
 @njit(**_OPTIONS)
 def layer_block(w, b, x, y):  # type: ignore[no-untyped-def]
-    """``y = w x + b`` for a block: w (m, k), x (k, BLOCK), y (m, BLOCK); k is a multiple of 4."""
+    """Compute ``y = w x + b`` for a block: w (m, k), x (k, BLOCK), y (m, BLOCK); k is a multiple of 4."""
     for j in range(w.shape[0]):
         out = y[j]
         bias = b[j]
@@ -164,7 +164,7 @@ def relu_block(y):  # type: ignore[no-untyped-def]
 
 @njit(**_OPTIONS)
 def layer_backward_block(w, x, dy, gw, gb, dx):  # type: ignore[no-untyped-def]
-    """Gradients of ``layer_block``: adds to ``gw`` and ``gb``, writes ``dx`` (k, BLOCK); k and m multiples of 4."""
+    """Add the gradients of ``layer_block`` to ``gw`` and ``gb``; write ``dx`` (k, BLOCK). k and m: multiples of 4."""
     for k in range(w.shape[1]):
         out = dx[k]
         for i in range(BLOCK):
@@ -196,7 +196,7 @@ def layer_backward_block(w, x, dy, gw, gb, dx):  # type: ignore[no-untyped-def]
 
 @njit(**_OPTIONS)
 def network_backward_block(w1, w2, x, h, dy, g1, gb1, g2, gb2, dh, dx):  # type: ignore[no-untyped-def]
-    """Gradients of the network: adds to ``g1`` to ``gb2``, writes ``dh`` and ``dx``; ``h`` is behind its ReLU."""
+    """Add the network's gradients to ``g1`` to ``gb2``; write ``dh`` and ``dx``. ``h`` is taken after its ReLU."""
     layer_backward_block(w2, h, dy, g2, gb2, dh)
     for j in range(h.shape[0]):
         for i in range(BLOCK):
@@ -273,7 +273,7 @@ def gradient(  # type: ignore[no-untyped-def]
 def adam_touched(  # type: ignore[no-untyped-def]
     table, table_grad, touched, m, v, step_size, beta1, beta2, epsilon
 ):
-    """One Adam step on the entries with any gradient; clears gradients and marks.
+    """Update the entries that have a gradient by one Adam step; clear gradients and marks.
 
     ``touched``: as ``encode_backward_block`` marks them; where there is no mark no entry is looked at. Other entries
     keep value and moments, as in ``torch.optim.SparseAdam``. ``step_size`` (levels,) already holds the bias correction

@@ -22,7 +22,7 @@ LOOKED_THROUGH = 3.0
 
 @njit(**_OPTIONS)
 def prior_inverse_depth(inverse, depth_edge, u, v):  # type: ignore[no-untyped-def]
-    """Inverse depth at index coordinates: bilinear on a surface, nearest at an edge."""
+    """Return the inverse depth at index coordinates: bilinear on a surface, nearest pixel at a depth edge."""
     height, width = inverse.shape
     v = min(max(v, np.float32(0)), np.float32(height - 1))
     u0, v0 = math.floor(u), math.floor(v)
@@ -146,7 +146,7 @@ def prior_agrees(x, y, z, inverse, depth_edge, known, tolerance):  # type: ignor
 
 @njit(**_OPTIONS)
 def prior_distance(x, y, z, inverse, depth_edge, band):  # type: ignore[no-untyped-def]
-    """Signed distance of a point of the camera frame to the prior's surface in its direction, in units of the band."""
+    """Return the signed distance of a point of the camera's frame to the surface in its direction, in bands."""
     height, width = inverse.shape
     flat = math.sqrt(x * x + y * y)
     u = np.float32((math.pi - math.atan2(y, x)) * (width / (2 * math.pi)) - 0.5)
@@ -208,7 +208,7 @@ def grid_span(origin, direction, low, cell, shape):  # type: ignore[no-untyped-d
 
 @njit(**_OPTIONS)
 def next_occupied(origin, direction, t, leave, grid, low, cell):  # type: ignore[no-untyped-def]
-    """First place from ``t`` on in an occupied cell, or −1 past ``leave``."""
+    """Return the first depth from ``t`` on that lies in an occupied cell; −1 beyond ``leave``."""
     nx, ny, nz = grid.shape
     per_cell = 1 / cell
     x, y, z = ((origin[0] - low[0]) * per_cell, (origin[1] - low[1]) * per_cell, (origin[2] - low[2]) * per_cell)

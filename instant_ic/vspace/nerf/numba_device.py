@@ -66,7 +66,7 @@ class NumbaDevice:
         self._scene, self._focus, self._priors = scene, scene.focus, StackedPriors.of(scene)
 
     def step(self, uniform: Floats, table_lr: float, network_lr: float) -> tuple[float, float]:
-        """One training step: sample rays, gradient, Adam; as ``reference.train_step``."""
+        """Train one step: sample rays, add gradients, update by Adam; as ``reference.train_step``."""
         self._steps += 1
         weight, sources = self._sample_rays(uniform)
         colour, distance = self._gradient(uniform, weight, sources)
@@ -105,7 +105,7 @@ class NumbaDevice:
         return colour / (1 + BAND_COLOUR_WEIGHT), distance / DISTANCE_WEIGHT
 
     def _adam(self, table_lr: float, network_lr: float) -> None:
-        """One Adam step of table and network; clears the gradients."""
+        """Update table and network by one Adam step; clear the gradients."""
         p = self._p
         betas = np.float32(BETA1), np.float32(BETA2), np.float32(EPSILON)
         step_sizes = self._level_rates * np.float32(adam_step_size(table_lr, self._steps))
@@ -148,7 +148,7 @@ class NumbaDevice:
         return self._scene.lattice.cells_per_m, self._scene.lattice.origin, self._focus
 
     def _trace(self, rays: Rays, depth_share: float) -> tuple[Floats, Floats]:
-        """Depth along the view's axis and confidence: every 4th pixel first, then what cannot be interpolated."""
+        """Return depth along the view's axis and confidence; trace every 4th pixel, then where interpolation fails."""
         height, width = rays.shape
         depth = np.zeros(height * width, np.float32)
         confidence = np.zeros(height * width, np.float32)

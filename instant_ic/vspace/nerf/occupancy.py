@@ -36,7 +36,7 @@ class Occupancy:
 
 
 def surface_points(prior: PanoramaPrior, cell_m: float) -> NDArray[np.float32]:
-    """Points of the prior's surfaces in the map frame, dense enough to leave no gap of a cell, (N, 3).
+    """Return points of the keyframe's surfaces in the map, (N, 3), dense enough to leave no gap of a cell.
 
     Quads of the room without a depth edge are divided where their corners are further apart than a cell (slanted
     planes), up to 16 × 16 parts. Along a quad the inverse depth is linear. An infinite ``cell_m`` gives the pixels'
@@ -76,7 +76,7 @@ def surface_points(prior: PanoramaPrior, cell_m: float) -> NDArray[np.float32]:
 
 
 def build_occupancy(priors: Sequence[PanoramaPrior], config: GeometryConfig) -> Occupancy:
-    """Occupancy grid of keyframes' surfaces together; ``MARGIN_CELLS`` are added round each surface."""
+    """Build the occupancy grid of keyframes' surfaces; ``MARGIN_CELLS`` are added around each surface."""
     corners = np.concatenate([surface_points(prior, math.inf) for prior in priors])
     low, high = corners.min(axis=0), corners.max(axis=0)  # parts of quads lie between their corners
     volume = float(np.prod((high - low).astype(np.float64) + 8 * config.cell_m))
@@ -94,7 +94,7 @@ def build_occupancy(priors: Sequence[PanoramaPrior], config: GeometryConfig) -> 
 
 
 def _spread(distance: NDArray[np.uint8]) -> None:
-    """City-block distance transform in place: exact, as the metric separates by axes."""
+    """Transform to city-block distances in place; this is exact, because the metric separates by axes."""
     for axis in range(3):
         lines = np.moveaxis(distance, axis, 0)
         for order in (1, -1):

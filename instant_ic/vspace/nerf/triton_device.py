@@ -86,7 +86,7 @@ class _StepBuffers:
 
 
 def kernel_shape(field: FieldConfig) -> dict[str, int]:
-    """Compile-time arguments of the kernels for a field's size; tiles are powers of two of at least 16."""
+    """Return the kernels' compile-time arguments for a field's size; tiles are powers of two of at least 16."""
     return {
         "LEVELS": field.levels,
         "LP": max(_power_of_two(field.levels), 16 // field.features),
@@ -216,7 +216,7 @@ class TritonDevice:
         return colours, fetched[3 * room : 3 * room + pixels], fetched[4 * room : 4 * room + pixels]
 
     def _lens(self, rays: Rays) -> tuple[Tensor, Floats]:
-        """Directions of a view on the GPU, and how they are turned into the map; a lens is uploaded once."""
+        """Return a view's directions on the GPU and their rotation into the map; a lens is uploaded once."""
         if not isinstance(rays, LensRays):
             return self._tensor(rays.directions), np.eye(3, dtype=np.float32)
         if self._newest_lens is None or self._newest_lens[0] is not rays.lens:
@@ -280,7 +280,7 @@ class TritonDevice:
         )
 
     def _forget(self) -> None:
-        """Moments start again, and so does the graph: it has the addresses of the scene and parameters before."""
+        """Clear the moments and the graph, which has the addresses of the earlier scene and parameters."""
         b = self._buffers
         for moment in (*b.table_moments, *b.network_moments, b.table_grad, b.network_grad):
             moment.zero_()

@@ -54,7 +54,7 @@ def band_samples(camera, surface, jitter, band, newest, newest_band, points, fir
 
 @njit(**_OPTIONS)
 def ray_weights(raw, first, span, weight, left):  # type: ignore[no-untyped-def]
-    """Weights of a ray's samples (SAMPLES,), and what of the light is left after each.
+    """Return the weights of a ray's samples and the light left after each, (SAMPLES,) each.
 
     ``raw``: logarithms of the density, entries ``first``….
     """

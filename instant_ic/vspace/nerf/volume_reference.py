@@ -13,7 +13,7 @@ from instant_ic.vspace.nerf.reference import TorchField, TorchPrior, query
 def band_samples(
     camera: Tensor, surface: Tensor, jitter: Tensor, band: Tensor, newest: TorchPrior
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Points (N, S, 3), offsets (N, S) and spans (N, S) of rays from ``camera`` (N, 3) to ``surface`` (N, 3)."""
+    """Sample rays from ``camera`` (N, 3) to ``surface`` (N, 3): points (N, S, 3), offsets (N, S), spans (N, S)."""
     step = 2.0 / SAMPLES
     offset = (torch.arange(SAMPLES, device=surface.device) + jitter[:, None]) * step - 1
     along = surface - camera
@@ -23,7 +23,7 @@ def band_samples(
 
 
 def ray_weights(raw: Tensor, span: Tensor) -> Tensor:
-    """Weights of samples (N, S) by the logarithms of the density (N, S)."""
+    """Return the weights of samples (N, S) from the logarithms of the density (N, S)."""
     thickness = raw.clamp(*RAW_LIMITS).exp() * span
     light = torch.exp(-thickness.cumsum(dim=1))
     before = torch.cat([torch.ones_like(light[:, :1]), light[:, :-1]], dim=1)
@@ -33,7 +33,7 @@ def ray_weights(raw: Tensor, span: Tensor) -> Tensor:
 def volume_loss(
     output: Tensor, offset: Tensor, span: Tensor, target: Tensor, weight: Tensor
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Colour, depth, opacity and distortion errors, means over the rays; see ``volume.volume_gradient``.
+    """Return the mean errors of colour, depth, opacity and distortion; see ``volume.volume_gradient``.
 
     Args:
         output: output of ``query``, (N, S, 4).
@@ -60,7 +60,7 @@ def volume_loss(
 def composite(
     field: TorchField, newest: TorchPrior, depth_share: float, origin: Tensor, directions: Tensor, depth: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Colours (P, 3) and depth (P,) of rays guided to ``depth`` (P,); see ``volume.composite``."""
+    """Composite rays guided to ``depth`` (P,); return colours (P, 3) and depth (P,); see ``volume.composite``."""
     met = torch.nonzero(depth)[:, 0]
     surface = origin + depth[met, None] * directions[met]
     away = (surface - newest.map_from_camera[:3, 3]).norm(dim=1)
