@@ -20,7 +20,7 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from decimal import Decimal
-from typing import Annotated, Any, Literal, TypeAlias, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, TypeAlias, get_args, get_origin, get_type_hints
 
 
 @dataclass(frozen=True)
@@ -123,23 +123,12 @@ def _numbers(value: Any) -> Iterator[float]:
         yield value
 
 
-@functools.cache
-def _choices(config_class: type[Any]) -> dict[str, tuple[Any, ...]]:
-    hints = get_type_hints(config_class)
-    return {
-        f.name: get_args(hint) for f in dataclasses.fields(config_class) if get_origin(hint := hints[f.name]) is Literal
-    }
-
-
 def check_ranges(config: Any) -> None:
-    """Check every field of a dataclass against its range or ``Literal``; for ``__post_init__``.
+    """Check every field of a dataclass against its range; for ``__post_init__``.
 
     Raises:
         ValueError: names the field, its range and the value.
     """
-    for name, allowed in _choices(type(config)).items():  # type: ignore[arg-type]
-        if (value := getattr(config, name)) not in allowed:
-            raise ValueError(f"{name} must be one of {', '.join(map(str, allowed))} (got {value!r})")
     for name, bounds in ranges(type(config)).items():  # type: ignore[arg-type]
         for value in _numbers(getattr(config, name)):
             if value not in bounds:

@@ -134,26 +134,16 @@ def resolved(value: Any) -> Any:
     return {key: resolved(part) for key, part in value.items()} if isinstance(value, dict) else value
 
 
-def dump_yaml(value: object, **style: Any) -> str:
-    """Return YAML with keys in their order, by the C emitter where there is one. Scalars keep their spelling."""
-    try:
-        return str(yaml.dump(value, Dumper=_FastDumper, sort_keys=False, **style))
-    except UnicodeEncodeError:  # half a surrogate pair, from a file name that is not UTF-8; Python escapes it
-        return str(yaml.dump(value, Dumper=_Dumper, sort_keys=False, **style))
-
-
 class _Dumper(yaml.SafeDumper):
-    pass
+    """Keeps the spelling of :class:`Scalar`."""
 
 
-class _FastDumper(getattr(yaml, "CSafeDumper", yaml.SafeDumper)):  # type: ignore[misc]
-    pass
+_Dumper.add_representer(Scalar, lambda dumper, scalar: dumper.represent_scalar(_implicit_tag(scalar.text), scalar.text))
 
 
-for _dumper in (_Dumper, _FastDumper):
-    _dumper.add_representer(
-        Scalar, lambda dumper, scalar: dumper.represent_scalar(_implicit_tag(scalar.text), scalar.text)
-    )
+def dump_yaml(value: object, **style: Any) -> str:
+    """Return YAML with keys in their order. Scalars keep their spelling."""
+    return str(yaml.dump(value, Dumper=_Dumper, sort_keys=False, **style))
 
 
 def one_line(value: object) -> str:

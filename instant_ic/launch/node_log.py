@@ -17,7 +17,7 @@ class NodeLog:
 
     Args:
         path: the log file.
-        report: called with a text when writing fails and when it works again; runs on the writing thread.
+        report: called with a text when writing fails; runs on the writing thread.
         max_bytes: a larger file is renamed to ``.log.1``, and a new one is started.
     """
 
@@ -38,16 +38,16 @@ class NodeLog:
                 self._rotate()
             if self._file is None:
                 self._open()
-            self._put(data)
+            assert self._file is not None
+            self._size += len(data)
+            if self._file.write(data) != len(data):
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+            self._failed = False
         except OSError as error:
             self.close()
             if not self._failed:
                 self._report(f"{self.path} cannot be written ({error.strerror}). Free some space; its lines are lost.")
             self._failed = True
-            return
-        if self._failed:
-            self._failed = False
-            self._report(f"{self.path} can be written again; lines are missing in it")
 
     def close(self) -> None:
         """Close the file; a later write opens it again."""
@@ -55,13 +55,6 @@ class NodeLog:
             file, self._file = self._file, None
             with suppress(OSError):  # write() has already reported a full disk
                 file.close()
-
-    def _put(self, data: bytes) -> None:
-        assert self._file is not None
-        written = self._file.write(data)
-        self._size += written or 0
-        if written != len(data):
-            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     def _open(self) -> None:
         make_folder(self.path.parent, exist_ok=True)

@@ -2,7 +2,7 @@
 
 import math
 from dataclasses import dataclass
-from typing import Annotated, Literal
+from typing import Annotated
 
 import pytest
 from hypothesis import given
@@ -21,7 +21,6 @@ class Ranged:
     angle: Annotated[float, Range(0, below=360)] = 0.0
     margins: tuple[NotNegative, ...] = (0.0,)
     limit: Annotated[float, Range(above=0, high=2)] | None = None
-    mode: Literal["a", "b"] = "a"
 
     def __post_init__(self):
         check_ranges(self)
@@ -37,7 +36,6 @@ class Ranged:
         ({"angle": 360.0}, r"angle must be >= 0 and < 360 \(got 360.0\)"),
         ({"margins": (1.0, -1.0)}, r"margins must be >= 0 \(got -1.0\)"),
         ({"limit": 3.0}, r"limit must be > 0 and <= 2 \(got 3.0\)"),
-        ({"mode": "c"}, r"mode must be one of a, b \(got 'c'\)"),
     ],
 )
 def test_value_outside_is_refused_in_words(values, words):
@@ -46,7 +44,7 @@ def test_value_outside_is_refused_in_words(values, words):
 
 
 def test_values_on_the_edge_are_taken():
-    Ranged(rate=1e-9, share=1.0, angle=359.9, margins=(0.0, 5.0), limit=2.0, mode="b")
+    Ranged(rate=1e-9, share=1.0, angle=359.9, margins=(0.0, 5.0), limit=2.0)
 
 
 @given(st.floats(), st.floats(-10, 10), st.floats(0, 10))

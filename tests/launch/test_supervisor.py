@@ -436,9 +436,8 @@ def test_full_disk_for_a_log_is_reported_once(tmp_path: Path, monkeypatch: pytes
     [report] = reports
     assert report.startswith(f"{path} cannot be written (No space left on device)")
     log.write(b"kept line\n")
-    assert reports[1] == f"{path} can be written again; lines are missing in it"
     log.close()
-    assert path.read_text() == "kept line\n"
+    assert len(reports) == 1 and path.read_text() == "kept line\n"
 
 
 def test_a_log_folder_that_cannot_be_written_does_not_keep_the_node_from_running(run_dir: Path) -> None:
