@@ -49,14 +49,13 @@ class _JudgedStack(FilmedStack):
 
 
 def samples(world: str, seed: int, episodes: int) -> list[dict[str, Any]]:
-    """Return terms, expected and measured PSNR of the frames of a world that show the view alone."""
+    """Return terms, expected and measured PSNR of the frames of a world."""
     settings, rows = TeleopSettings(episodes, seed, world, ("ic",), pictures=False), []
     stacks: list[_JudgedStack] = []
 
     def note(frame: IllusionFrame, *_: Any) -> None:
-        if frame.blend == 1:
-            shown, expected = frame.scores[LIVE].psnr_db, frame.expected_psnr_db
-            rows.append({"terms": stacks[-1].terms, "psnr_db": shown, "expected_db": expected})
+        shown, expected = frame.scores[LIVE].psnr_db, frame.expected_psnr_db
+        rows.append({"terms": stacks[-1].terms, "psnr_db": shown, "expected_db": expected})
 
     for index in range(episodes):
         course = settings.course(index)

@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from instant_ic.depth.files import DEPTH_SUFFIXES, PICTURE_SUFFIXES
 from instant_ic.depth.metrics import DepthMetrics, depth_metrics, mean_metrics
 from instant_ic.depth.scaler import ScalerConfig
 from instant_ic.depth.sources import DepthSource, SourceConfig, complete
@@ -247,38 +246,20 @@ def _rounded(value: Any) -> Any:
 
 
 def pair(images: Sequence[Path], truths: Sequence[Path]) -> list[tuple[Path, Path | None]]:
-    """Pair each image with the depth file of the same stem (``room.jpg``, ``room.npy``), or with None.
-
-    Paths are files or folders. A single image and a single depth file are paired whatever their names. A stem may end
-    in ``_rgb`` or ``_depth``; a folder's files that end in ``_depth`` are no images.
+    """Pair images and depth files in their order, or each image with None.
 
     Raises:
-        DepthEvaluationError: a path is missing, a folder holds no image, or no image has a depth file.
+        DepthEvaluationError: their numbers differ, or the stems of a pair (beside ``_rgb`` and ``_depth``).
     """
-    found = [path for path in _files(images, PICTURE_SUFFIXES) if not path.stem.endswith("_depth") or path in images]
-    if not found:
-        raise DepthEvaluationError(f"{images[0]}: no image in this folder ({', '.join(PICTURE_SUFFIXES)})")
-    depth = [path for path in _files(truths, DEPTH_SUFFIXES) if path not in found]
-    if len(found) == len(depth) == 1:
-        return [(found[0], depth[0])]
-    by_stem = {_stem(path): path for path in depth}
-    pairs = [(image, by_stem.get(_stem(image))) for image in found]
-    if truths and not any(truth for _, truth in pairs):
-        raise DepthEvaluationError(f"no depth file has the stem of an image ({found[0].name}, ...)")
-    return pairs
-
-
-def _files(paths: Sequence[Path], suffixes: tuple[str, ...]) -> list[Path]:
-    found: list[Path] = []
-    for path in paths:
-        if path.is_dir():
-            found += sorted(file for file in path.iterdir() if file.suffix.lower() in suffixes)
-        elif path.is_file():
-            found.append(path)
-        else:
-            raise DepthEvaluationError(f"{path}: no such file or folder")
-    return found
-
-
-def _stem(path: Path) -> str:
-    return path.stem.removesuffix("_rgb").removesuffix("_depth")
+    if not truths:
+        return [(image, None) for image in images]
+    if len(images) != len(truths):
+        raise DepthEvaluationError(
+            f"{len(images)} images and {len(truths)} depth files: give one for each image, in the same order"
+        )
+    for image, truth in zip(images, truths, strict=True):
+        if len(images) > 1 and image.stem.removesuffix("_rgb") != truth.stem.removesuffix("_depth"):
+            raise DepthEvaluationError(
+                f"{image.name} and {truth.name} have different stems: are they in the same order?"
+            )
+    return list(zip(images, truths, strict=True))

@@ -2,14 +2,14 @@
 
 The page renders the layers of the virtual space itself, at the v-bot's present pose. Here the CPU renderer takes its
 place. A second virtual space gets the same keyframes with the simulator's true depth. Both render the same views. Not
-modelled: the paler colours of estimated surfaces, colour matching at a switch, and overlays.
+modelled: the paler colours of estimated surfaces, the dissolve and colour matching at a switch, and overlays.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
@@ -17,12 +17,11 @@ from numpy.typing import NDArray
 
 from instant_ic.adapters.nerf import decode_keyframe
 from instant_ic.bus.lockstep import Record
-from instant_ic.experiments.teleop import photograph
 from instant_ic.experiments.teleop_stack import SimulatedStack, StackConfig
 from instant_ic.experiments.teleop_worlds import Course
 from instant_ic.experiments.worlds import Obstacle, without
 from instant_ic.geometry.image_quality import psnr_db, ssim
-from instant_ic.geometry.poses import pose2_from_matrix, pose_matrix
+from instant_ic.geometry.poses import pose_matrix
 from instant_ic.msg import deserialize
 from instant_ic.sim.render import EquirectRenderer
 from instant_ic.vspace import VirtualSpace
@@ -96,7 +95,6 @@ class IllusionFrame:
 
     Attributes:
         episode, time_s: episode and simulated seconds.
-        blend: 1 where the view is shown alone, less while it dissolves into the camera's image or out of it.
         distance_m: position behind the near face of the obstacle that is passed, negative before it; None without any.
         with_obstacle: the truth is the world with the obstacle.
         scores: score of each source against that truth.
@@ -106,7 +104,6 @@ class IllusionFrame:
 
     episode: int
     time_s: float
-    blend: float
     distance_m: float | None
     with_obstacle: bool
     scores: dict[str, Score]
@@ -141,7 +138,6 @@ class FilmedStack(SimulatedStack):
         self._truth_space: VirtualSpace | None = None
         self._world_from_map = np.eye(4)
         self._next_frame_s = 0.0
-        self._blend = 0.0
         self._passage: Passage | None = None
         self._mode = ""
         self._renderers: dict[Obstacle, EquirectRenderer] = {}
@@ -173,16 +169,12 @@ class FilmedStack(SimulatedStack):
 
     def step(self, operate: Callable[[], tuple[float, float]] | None = None) -> None:
         """Advance the stack; then compare a frame if one is due and the page shows the virtual space."""
-        before = self.time_s
         super().step(operate)
         mode = str(self.page.state.get("mode", ""))
         if mode == "entering" and self._mode not in ("entering", "virtual"):
             self._passage = Passage.of(self.vbot, self._course.obstacles)
         self._mode = mode
-        dissolve_s = self.nodes["console"].config.dissolve_ms / 1e3
-        change = (self.time_s - before) / dissolve_s if dissolve_s > 0 else 1.0
-        self._blend = min(max(self._blend + (change if self.page.virtual else -change), 0.0), 1.0)
-        if self._blend > 0 and self.space is not None and self.time_s >= self._next_frame_s:
+        if self.page.virtual and self.space is not None and self.time_s >= self._next_frame_s:
             self._next_frame_s = self.time_s + FRAME_S - 1e-9
             self._compare()
 
@@ -202,14 +194,9 @@ class FilmedStack(SimulatedStack):
         self.on_view(live, map_from_shown)
         views = {LIVE: live, TRUE_DEPTH: true_depth}
         images = {name: view.rgb for name, view in views.items()}
-        if self._blend < 1:
-            camera = self._camera_image(world_from_shown)
-            share = self._blend**2 * (3 - 2 * self._blend)  # the page dissolves by a smooth step
-            images = {name: _mixed(camera, image, share) for name, image in images.items()}
         frame = IllusionFrame(
             self._episode,
             self.time_s,
-            self._blend,
             distance_m,
             with_obstacle,
             {name: Score(psnr_db(image, truth.rgb), ssim(image, truth.rgb)) for name, image in images.items()},
@@ -217,13 +204,6 @@ class FilmedStack(SimulatedStack):
             live.expected_psnr_db,
         )
         self._emit(frame, images, truth.rgb)
-
-    def _camera_image(self, world_from_shown: FloatArray) -> Image:
-        newest = self.newest.get(False)
-        if newest is None:
-            return np.zeros((self.size[1], self.size[0], 3), np.uint8)
-        photo = replace(newest, heading=float(pose2_from_matrix(world_from_shown)[2]))
-        return photograph(self, photo, *self.size, FOV_RAD)
 
     def _truth_at(self, world_from_camera: FloatArray) -> tuple[EquirectRenderer, float | None, bool]:
         """Return the truth's renderer at a pose, the distance behind the near face, and whether it has the obstacle.
@@ -240,9 +220,3 @@ class FilmedStack(SimulatedStack):
         if obstacle not in self._renderers:
             self._renderers[obstacle] = EquirectRenderer(without(self._course.world, obstacle))
         return self._renderers[obstacle], distance_m, False
-
-
-def _mixed(camera: Image, view: Image, share: float) -> Image:
-    """Return a mixture of two images, with ``share`` of the view."""
-    mixed = camera + share * (view.astype(np.float32) - camera)
-    return np.rint(np.clip(mixed, 0, 255)).astype(np.uint8)

@@ -86,7 +86,7 @@ def test_a_poster_over_the_removed_box_stays() -> None:
 
 def frame(distance_m: float | None, db: float, expected: float = 25.0) -> IllusionFrame:
     scores = dict.fromkeys(SOURCES, Score(db, 0.5))
-    return IllusionFrame(0, 1.0, 1.0, distance_m, False, scores, dict.fromkeys(SOURCES, 0.1), expected)
+    return IllusionFrame(0, 1.0, distance_m, False, scores, dict.fromkeys(SOURCES, 0.1), expected)
 
 
 def test_figures_by_hand() -> None:

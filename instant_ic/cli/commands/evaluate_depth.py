@@ -24,13 +24,13 @@ _THREADS = 2
 def add_kind(kinds: Any) -> None:
     add = verb(
         kinds, "depth", "compare estimated depth of panoramas with the true depth", evaluate_depth,
-        "ic evaluate depth rgb/ --depth depth/ --lidar --outliers 0.05 --json out.json --plot out.png",
+        "ic evaluate depth rgb/*.jpg --depth depth/*.png --lidar --outliers 0.05 --json out.json --plot out.png",
         "Estimate the depth of level 360° panoramas as the robot does and compare it with the true depth: MRE, "
         "MAE, RMSE, δ1 to δ3, scale error and time, for each image and on average, before and after scaling. "
         "Prints JSON. Without --depth there is no comparison: use --plot to see the estimate.",
     ).add_argument  # fmt: skip
-    add("images", type=Path, nargs="+", metavar="IMAGES", help="panoramas (2:1): files or folders")
-    text = "true radial depth: files or a folder, same stems as the images; 16-bit PNG in millimetres, .npy or "
+    add("images", type=Path, nargs="+", metavar="IMAGES", help="panoramas (2:1)")
+    text = "true radial depth in the order of the images, same stems; 16-bit PNG in millimetres, .npy or "
     text += ".npz (key depth) in metres; 0 = unknown"
     add("--depth", type=Path, nargs="+", default=[], metavar="GT", help=text)
     add("--model", type=Path, metavar="M", help="ONNX file with its manifest (default: the shipped one)")
@@ -75,8 +75,6 @@ def evaluate_depth(args: argparse.Namespace) -> int:
     with progress("depth") as advance:
         for done, (image, truth) in enumerate(pairs, 1):
             try:
-                if args.depth and truth is None:
-                    raise DepthEvaluationError(f"{image}: no depth file has this stem")
                 truth_m = load_depth(truth, args.png_unit) if truth is not None else None
                 scored = evaluator.score(image.name, load_picture(image), truth_m)
                 rows.append(scored.as_dict() | {"image": str(image), "truth": str(truth) if truth else None})
