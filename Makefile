@@ -2,7 +2,7 @@
 # make test   format, lint, types and all tests
 # make check  format, lint and types; the page too, where Node.js is installed
 # make lock   write requirements*.lock anew after a change of constraints.txt or pyproject.toml (needs network)
-# make newest the unit tests with the newest version of everything, in .venv-newest/ (PYTHON=; default the newest here)
+# make newest the unit tests with the newest version of everything, in .venv-newest/ (PYTHON=python3.13)
 # make fuzz   a thousand times the mutated inputs of `make test` for each parser of outside bytes: hours (ARGS="-k glb")
 # make clean  take away what these made
 PYTHON ?= python3
@@ -27,7 +27,7 @@ test: check install-tests chromium
 
 NEWEST := .venv-newest
 newest:
-	@options=$$($(PYTHON) scripts/newest.py $(NEWEST) $(if $(filter file,$(origin PYTHON)),,--python $(PYTHON))) || exit; \
+	@options=$$($(PYTHON) scripts/newest.py $(NEWEST)) || exit; \
 	$(NEWEST)/bin/ic compile || { echo "make newest: ic compile FAILED"; exit 1; }; \
 	units=passed; \
 	$(NEWEST)/bin/python -m pytest -n 2 --dist loadgroup -m "not system" $$options $(ARGS) || units=FAILED; \

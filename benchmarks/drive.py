@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import time
 from collections.abc import AsyncIterator, Callable
 from typing import Any
 
@@ -19,7 +20,8 @@ class DriveRecorder:
     """Records a drive from the bus.
 
     Attributes:
-        modes: every change of mode, including the first mode (ControlState.REAL, ...), with its reason in ``reasons``.
+        modes: every change of mode, including the first mode (ControlState.REAL, ...), with its reason in ``reasons``
+            and its time on the machine's steady clock in ``mode_times_s``.
         truth: ground-truth poses of the r-bot, (x, y, yaw) in the world.
         vbot: poses of the v-bot in the map while it was active.
         vbot_pose: newest pose of the v-bot; None before the first.
@@ -30,6 +32,7 @@ class DriveRecorder:
 
     def __init__(self, stack: Stack) -> None:
         self.modes: list[int] = []
+        self.mode_times_s: list[float] = []
         self.reasons: list[str] = []
         self.truth: list[NDArray[np.float64]] = []
         self.vbot: list[NDArray[np.float64]] = []
@@ -53,6 +56,7 @@ class DriveRecorder:
     def _on_state(self, message: Any) -> None:
         if message.mode != self.mode:
             self.modes.append(message.mode)
+            self.mode_times_s.append(time.monotonic())
             self.reasons.append(message.reason)
 
     def _on_contact(self, message: Any) -> None:

@@ -30,7 +30,7 @@ from cpu_usage import ReferenceLoop, Usage, cpu_percent, usage
 from drive import DriveRecorder
 from reporting import note, parser_for, report
 
-from instant_ic.bus import LATCHED, RELIABLE
+from instant_ic.bus import RELIABLE
 from instant_ic.experiments.stack import Stack, StackError, free_ports, processes_of
 from instant_ic.msg import ControlState, message_type, twist_values
 
@@ -61,39 +61,6 @@ for (const name of ['drawArrays', 'drawElements']) {
   };
 }
 """
-
-
-class StackWatch:
-    """Modes and camera images of the stack, by the machine's clock."""
-
-    def __init__(self, stack: Stack) -> None:
-        self.modes: list[tuple[float, int]] = []
-        self.images = 0
-        observer = stack.observer
-        observer.subscribe("/ic/state", message_type("ControlState"), self._on_state, LATCHED)
-        observer.subscribe("/camera/image/compressed", message_type("CompressedImage"), self._on_image)
-
-    def _on_state(self, message: Any) -> None:
-        if not self.modes or self.modes[-1][1] != message.mode:
-            self.modes.append((time.monotonic(), message.mode))
-
-    def _on_image(self, message: Any) -> None:
-        self.images += 1
-
-    def since(self, began_s: float) -> list[int]:
-        """Return the mode at a moment and each change after it."""
-        before = [mode for at, mode in self.modes if at <= began_s]
-        return before[-1:] + [mode for at, mode in self.modes if at > began_s]
-
-    def stopped_s(self, began_s: float, ended_s: float) -> float:
-        """Return the seconds in STOPPED between two moments."""
-        ends = [at for at, _ in self.modes[1:]] + [ended_s]
-        spans = [
-            (max(at, began_s), min(end, ended_s))
-            for (at, mode), end in zip(self.modes, ends, strict=True)
-            if mode == ControlState.STOPPED
-        ]
-        return sum(max(0.0, end - start) for start, end in spans)
 
 
 @dataclass(frozen=True)
@@ -128,7 +95,9 @@ class PageDrive:
     def __init__(self, stack: Stack, run_dir: Path) -> None:
         self.result: dict[str, Any] = {"completed": False}
         self._stack, self._run_dir = stack, run_dir
-        self._recorder, self._watch = DriveRecorder(stack), StackWatch(stack)
+        self._recorder = DriveRecorder(stack)
+        self._images = 0
+        stack.observer.subscribe("/camera/image/compressed", message_type("CompressedImage"), self._on_image)
         self._paces: list[float] = []
         self._page: Any = None
 
@@ -162,7 +131,7 @@ class PageDrive:
             browser.close()
 
     def _through_the_box(self, errors: list[str]) -> None:
-        started, images = time.monotonic(), self._watch.images
+        started, images, first = time.monotonic(), self._images, len(self._recorder.modes) - 1
         try:
             self._hold(lambda: self._recorder.mode == ControlState.VIRTUAL, "VIRTUAL")
             before = self._sample()
@@ -171,19 +140,25 @@ class PageDrive:
             self.result["virtual"] = before.until(self._sample())
             self._wait(lambda: self._recorder.mode == ControlState.REAL, 180, "REAL behind the box")
             self._page.wait_for_timeout(1500)
-            modes = [mode for mode in self._watch.since(started) if mode != ControlState.STOPPED]
+            modes = [mode for mode in self._recorder.modes[first:] if mode != ControlState.STOPPED]
             self.result["completed"] = modes == PASSAGE and not self._recorder.contact and not errors
         finally:
-            self.result |= self._figures(started, images) | {"page_errors": errors}
+            self.result |= self._figures(started, images, first) | {"page_errors": errors}
 
-    def _figures(self, started: float, images: int) -> dict[str, Any]:
+    def _on_image(self, message: Any) -> None:
+        self._images += 1
+
+    def _figures(self, started: float, images: int, first: int) -> dict[str, Any]:
         ended, recorder, paces = time.monotonic(), self._recorder, self._paces
-        modes = self._watch.since(started)
+        modes, ends_s = recorder.modes[first:], [*recorder.mode_times_s[first + 1 :], ended]
+        spans = zip(modes, recorder.mode_times_s[first:], ends_s, strict=True)
         return {
             "mode_changes": len(modes) - 1,
             "modes": modes,
-            "stopped_s": round(self._watch.stopped_s(started, ended), 2),
-            "camera_hz": round((self._watch.images - images) / (ended - started), 2),
+            "stopped_s": round(
+                sum(end - max(at, started) for mode, at, end in spans if mode == ControlState.STOPPED), 2
+            ),
+            "camera_hz": round((self._images - images) / (ended - started), 2),
             "page_fps": self.result.get("virtual", {}).get("page_fps"),
             "pace": {"mean": round(statistics.mean(paces), 2), "min": round(min(paces), 2)} if paces else None,
             "contact": recorder.contact,
@@ -220,7 +195,7 @@ class PageDrive:
 
     def _sample(self) -> LoadSample:
         frames = int(self._page.evaluate("window.__frames"))
-        return LoadSample(usage(self._run_dir), browser_cpu_s(), self._watch.images, frames)
+        return LoadSample(usage(self._run_dir), browser_cpu_s(), self._images, frames)
 
     def _standing(self, seconds: float) -> dict[str, Any]:
         before, end = self._sample(), time.monotonic() + seconds

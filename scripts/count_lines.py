@@ -35,10 +35,14 @@ def lines_by_package() -> dict[str, int]:
 
 
 def parameters() -> dict[str, int]:
-    """Count the parameters of each node."""
-    from instant_ic.bus.node_files import node_class
-    from instant_ic.config.parameter_info import parameter_infos
-    from instant_ic.util.paths import node_names
+    """Count the parameters of each node; none where the project's packages are missing."""
+    try:
+        from instant_ic.bus.node_files import node_class
+        from instant_ic.config.parameter_info import parameter_infos
+        from instant_ic.util.paths import node_names
+    except ImportError as error:
+        print(f"no parameters ({error}): run it with .venv/bin/python", file=sys.stderr)
+        return {}
 
     return {name: len(parameter_infos(node_class(name).config_class())) for name in node_names()}
 

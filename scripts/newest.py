@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
 """An environment with the newest version of everything, without pins, for the unit tests of `make newest`.
 
-    python scripts/newest.py FOLDER [--python PYTHON]    # default: the newest of 3.11 to 3.14 here
+    python3.13 scripts/newest.py FOLDER
 
 Torch is installed where it has a CPU build for that Python; its CUDA build of several gigabytes never is. Prints the
 options that pytest needs.
@@ -11,29 +11,13 @@ from __future__ import annotations
 
 import argparse
 import re
-import shutil
 import subprocess
 import sys
 import tomllib
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
-VERSIONS = ("3.14", "3.13", "3.12", "3.11")
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
-
-
-def newest_python() -> str:
-    """Return the newest interpreter on PATH.
-
-    Raises:
-        SystemExit: there is none.
-    """
-    for version in VERSIONS:
-        python = shutil.which(f"python{version}")
-        # A shim of pyenv is on PATH whether or not its version is selected.
-        if python and subprocess.run([python, "-c", ""], capture_output=True).returncode == 0:
-            return python
-    sys.exit(f"none of Python {', '.join(VERSIONS)} is here: make newest PYTHON=PATH")
 
 
 def requirements() -> list[str]:
@@ -61,10 +45,8 @@ def run(what: str, command: list[str | Path]) -> None:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", type=Path, help="the environment, made again each time")
-    parser.add_argument("--python", default="", help="interpreter; default the newest of 3.11 to 3.14 here")
     args = parser.parse_args()
-    python = args.python or newest_python()
-    run("making the environment", [python, "-m", "venv", "--clear", args.folder])
+    run("making the environment", [sys.executable, "-m", "venv", "--clear", args.folder])
     inside = str(args.folder / "bin" / "python")
     pip = [inside, "-m", "pip", "install", "-q", "--disable-pip-version-check", "--progress-bar", "off"]
     no_torch = args.folder / "no-torch.txt"

@@ -1,4 +1,4 @@
-"""``make newest``: which interpreter and which packages it takes, and what it skips without torch."""
+"""``make newest``: which packages it takes, and what it skips without torch."""
 
 import os
 import subprocess
