@@ -70,22 +70,3 @@ class ManualClock:
     def set(self, now_ns: int) -> None:
         """Set the time. It may go back, for example when a player loops."""
         self._now_ns = int(now_ns)
-
-
-class JumpDetector:
-    """Detects that somebody set the machine's clock, by comparing it with the steady clock.
-
-    Args:
-        tolerance_s: smaller differences count as the machine's own corrections.
-    """
-
-    def __init__(self, tolerance_s: float = 0.5) -> None:
-        self._tolerance_ns = int(tolerance_s * 1e9)
-        self._offset_ns = time.time_ns() - time.monotonic_ns()
-
-    def jump_s(self) -> float:
-        """Return the seconds the clock was set forward since the last call (negative: back); 0.0 if it was not set."""
-        offset_ns = time.time_ns() - time.monotonic_ns()
-        jumped_ns = offset_ns - self._offset_ns
-        self._offset_ns = offset_ns
-        return jumped_ns / 1e9 if abs(jumped_ns) > self._tolerance_ns else 0.0

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any, ClassVar, Generic, TypeVar, get_args
 
 from instant_ic.bus.callbacks import Callbacks
-from instant_ic.bus.clock import Clock, JumpDetector
+from instant_ic.bus.clock import Clock
 from instant_ic.bus.diagnostics import Diagnostics
 from instant_ic.bus.node_parameters import NodeParameters
 from instant_ic.bus.node_report import NodeReport
@@ -272,7 +272,6 @@ class Node(Generic[ConfigT]):
     def spin(self) -> None:
         """Run callbacks until :meth:`stop`."""
         next_report = 0.0
-        system_clock = JumpDetector()
         while not self._stop.is_set():
             self._transport.clear()
             self.spin_once()
@@ -283,10 +282,6 @@ class Node(Generic[ConfigT]):
                     self.node_report.beat()
                     self.node_report.publish_diagnostics()
                 self.diagnostics.end_start_grace()
-                if (jump_s := system_clock.jump_s()) and not self.use_sim_time:
-                    self.log.warning(
-                        "the machine's clock was set by %+.1f s: stamps jump, timers are not affected", jump_s
-                    )
             wait = next_report - now
             if (timer_ns := self.timers.next_ns()) is not None:
                 due_s = (timer_ns - self.clock.steady_ns()) / 1e9

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import pytest
 
 from instant_ic.bus import SENSOR
-from instant_ic.bus.clock import JumpDetector, ManualClock, SystemClock
+from instant_ic.bus.clock import ManualClock
 from instant_ic.bus.lockstep import LockstepBus
 from instant_ic.bus.node import Node
 from instant_ic.bus.transport import Received
@@ -86,18 +86,3 @@ def test_waiting_in_the_queue_counts_as_age(bus: LockstepBus) -> None:
     came_ns = bus.clock.steady_ns() - 3 * S // 10
     node.heard.put(String(data="old"), Received("/chatter", "", b"", 0, 0, 0, steady_ns=came_ns))
     assert node.heard.age_s == pytest.approx(0.3)
-
-
-def test_jump_is_seen_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    wall, steady = [1000 * S], [7 * S]
-    monkeypatch.setattr("instant_ic.bus.clock.time.time_ns", lambda: wall[0])
-    monkeypatch.setattr("instant_ic.bus.clock.time.monotonic_ns", lambda: steady[0])
-    detector = JumpDetector(tolerance_s=0.5)
-    wall[0] += 3 * S
-    steady[0] += 3 * S
-    assert detector.jump_s() == 0.0
-    wall[0] -= 3600 * S
-    assert detector.jump_s() == -3600.0 and detector.jump_s() == 0.0
-    wall[0] += S // 10  # the machine's own corrections
-    assert detector.jump_s() == 0.0
-    assert SystemClock().now_ns() == wall[0] and SystemClock().steady_ns() == steady[0]
