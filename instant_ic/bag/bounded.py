@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from io import BytesIO
 from types import SimpleNamespace
-from typing import TYPE_CHECKING, NoReturn
+from typing import TYPE_CHECKING, Any, NoReturn
 
+import lz4.frame
 import yaml
+import zstandard
 
 from instant_ic.bag.message import BagError
 from instant_ic.config.yaml_text import compose_yaml
@@ -35,20 +37,28 @@ def decompress(data: bytes | memoryview, compression: str, declared_bytes: int |
         raise ValueError(f"it declares {most_bytes} bytes; the limit is {MOST_CHUNK_BYTES}")
     if compression == "":
         return bytes(data)
-    pieces = _PIECES.get(compression)
-    if pieces is None:
-        raise ValueError(f"unknown compression {compression[:40]!r}")
     out: list[bytes] = []
     size = 0
     try:
-        for piece in pieces(bytes(data)):
-            size += len(piece)
-            if size > most_bytes:
-                raise ValueError(f"it decompresses to more than {most_bytes} bytes, its declared or maximum size")
-            out.append(piece)
-    except (RuntimeError, EOFError) as error:  # raised by lz4
+        with _opened(data, compression) as stream:
+            while piece := stream.read(_PIECE):
+                size += len(piece)
+                if size > most_bytes:
+                    raise ValueError(f"it decompresses to more than {most_bytes} bytes, its declared or maximum size")
+                out.append(piece)
+    except EOFError:  # truncated
+        pass
+    except (RuntimeError, zstandard.ZstdError) as error:  # RuntimeError is raised by lz4
         raise ValueError(str(error)) from None
     return b"".join(out)
+
+
+def _opened(data: bytes | memoryview, compression: str) -> Any:
+    if compression == "zstd":
+        return zstandard.open(BytesIO(data), "rb")
+    if compression == "lz4":
+        return lz4.frame.open(BytesIO(data), "rb")
+    raise ValueError(f"unknown compression {compression[:40]!r}")
 
 
 def guard_rosbags() -> None:
@@ -111,29 +121,3 @@ def _limit_schema(connection: apsw.Connection) -> None:
 def _refuse_file(stream: object, _mode: str) -> NoReturn:
     name = getattr(stream, "name", "a file")
     raise BagError(f"{name} is compressed as a whole; convert its bag first: rosbags-convert --src BAG --dst NEW")
-
-
-def _zstd(data: bytes) -> Iterator[bytes]:
-    import zstandard
-
-    reader = zstandard.ZstdDecompressor().stream_reader(data)
-    try:
-        while piece := reader.read(_PIECE):
-            yield piece
-    except zstandard.ZstdError as error:
-        raise ValueError(str(error)) from None
-
-
-def _lz4(data: bytes) -> Iterator[bytes]:
-    import lz4.frame
-
-    decompressor = lz4.frame.LZ4FrameDecompressor()
-    piece = decompressor.decompress(data, _PIECE)
-    while piece:
-        yield piece
-        if decompressor.eof or decompressor.needs_input:
-            return
-        piece = decompressor.decompress(b"", _PIECE)
-
-
-_PIECES: dict[str, Callable[[bytes], Iterator[bytes]]] = {"zstd": _zstd, "lz4": _lz4}
