@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 
 from instant_ic.bus.lockstep import LockstepBus
+from instant_ic.cli.message_input import build
 from instant_ic.console import FrameKind, Look, ViewConfig
 from instant_ic.console.config import ConsoleConfig
 from instant_ic.console.layers import PageLayer, PageLayers
 from instant_ic.control.robot_lease import RELEASED
 from instant_ic.geometry.poses import matrix_from_quaternion, pose_matrix
 from instant_ic.msg import (
-    BatteryState,
     ControlState,
     NodeStatus,
     RenderedView,
@@ -28,9 +28,7 @@ from instant_ic.msg import (
     pose_message,
     pose_stamped,
     stamp_ns,
-    to_time,
     transform_message,
-    twist_message,
     twist_values,
 )
 from instant_ic.vspace.layer_mesh import LayerMesh
@@ -88,31 +86,9 @@ def setup():
 
 def control(bus, mode, **values):
     """A ControlState of now."""
-    pose = pose_message(np.eye(4))
-    fields = {
-        "header": header("map", bus.clock.now_ns()),
-        "mode": mode,
-        "reason": "",
-        "estop": False,
-        "blocked": False,
-        "transitions": 0,
-        "robot_pose": pose,
-        "vbot_start": pose,
-        "vbot_pose": pose,
-        "operator_command": twist_message(),
-        "applied_command": twist_message(),
-        "pose_gap_m": 0.0,
-        "yaw_gap_rad": 0.0,
-        "time_to_obstacle_s": math.inf,
-        "shown": int(mode in (ControlState.VIRTUAL, ControlState.RETURNING)),
-        "vbot_action": 0,
-        "vbot_target": pose,
-        "robot_twist": twist_message(),
-        "vbot_limit_m_s": 0.5,
-        "reason_code": 0,
-        "holder": "",
-    }
-    return ControlState(**(fields | values))
+    shown = int(mode in (ControlState.VIRTUAL, ControlState.RETURNING))
+    blank = build("ControlState", {"header": "auto", "mode": int(mode), "shown": shown}, bus.clock.now_ns())
+    return dataclasses.replace(blank, **values)
 
 
 def publish_tree(bus, x=1.0, y=2.0, yaw=math.pi / 2):
@@ -130,12 +106,7 @@ def publish_tree(bus, x=1.0, y=2.0, yaw=math.pi / 2):
 
 
 def vspace_status(state):
-    return VspaceStatus(
-        header=header("", 0), state=state, keyframe_id=1, keyframe_pose=pose_message(np.eye(4)),
-        keyframe_stamp=to_time(0), ready_radius_m=2.0, psnr_db=27.5, expected_psnr_db=26.0, unseen_share=0.1,
-        train_seconds=9.0, ready_seconds=8.0, iterations=1, ms_per_iteration=1.0, render_ms=20.0, render_fps=10.0,
-        device="cpu", message="",
-    )  # fmt: skip
+    return build("VspaceStatus", {"state": int(state), "psnr_db": 27.5}, 0)
 
 
 def view_message(bus, request_id, fov=1.8):
@@ -444,18 +415,13 @@ def test_faults_are_told_in_the_words_of_the_node_that_found_them(setup):
     assert server.texts["health"]["faults"] == []  # told no more, so it is over
 
 
-def heartbeat(node, state):
-    return NodeStatus(
-        header=header("", 0), node=node, pid=1, state=state, message="", cpu_percent=0.0, rss_mb=0.0, inputs=[],
-        input_rates_hz=np.zeros(0, np.float32), input_ages_s=np.zeros(0, np.float32),
-        input_lost=np.zeros(0, np.uint64), lost_topics=[], lost_publishers=[], lost_counts=np.zeros(0, np.uint64),
-        outputs=[], output_rates_hz=np.zeros(0, np.float32), output_ages_s=np.zeros(0, np.float32),
-    )  # fmt: skip
+def heartbeat(node, state, cpu_percent=0.0):
+    return build("NodeStatus", {"node": node, "state": int(state), "cpu_percent": cpu_percent}, 0)
 
 
 def test_health_lists_the_cpu_of_the_running_nodes(setup):
     bus, _, server = setup
-    bus.publish("/heartbeat", dataclasses.replace(heartbeat("nerf", NodeStatus.RUNNING), cpu_percent=21.26))
+    bus.publish("/heartbeat", heartbeat("nerf", NodeStatus.RUNNING, 21.26))
     bus.publish("/heartbeat", heartbeat("mine", NodeStatus.RUNNING))
     bus.publish("/heartbeat", heartbeat("bag_player", NodeStatus.STOPPING))
     bus.advance(1.1)
@@ -475,16 +441,7 @@ def test_dead_node_is_a_fault_and_one_that_ended_is_not(setup):
 def test_vspace_and_battery_are_told(setup):
     bus, _, server = setup
     bus.publish("/vspace/status", vspace_status(VspaceStatus.READY), latched=True)
-    empty = np.zeros(0, np.float32)
-    bus.publish(
-        "/battery",
-        BatteryState(
-            header=header("", 0), voltage=24.5, temperature=math.nan, current=0.0, charge=0.0, capacity=0.0,
-            design_capacity=0.0, percentage=math.nan, power_supply_status=0, power_supply_health=0,
-            power_supply_technology=0, present=True, cell_voltage=empty, cell_temperature=empty, location="",
-            serial_number="",
-        ),
-    )  # fmt: skip
+    bus.publish("/battery", build("BatteryState", {"voltage": 24.5, "percentage": math.nan}, 0))
     bus.advance(1.1)
     health = server.texts["health"]
     assert health["vspace"]["state"] == "ready"
