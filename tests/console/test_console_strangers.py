@@ -182,12 +182,6 @@ async def test_an_emergency_stop_comes_by_a_connection_of_its_own(serve):
     server = serve()
     async with ConsoleClient(server.url) as driver, aiohttp.ClientSession() as http:
         await driver.acquire()
-        async with http.post(server.url + "estop", headers={"Origin": "http://evil.example"}) as response:
-            assert response.status == 403
-        host = f"evil.example:{server.port}"
-        async with http.post(server.url + "estop", headers={"Host": host, "Origin": f"http://{host}"}) as response:
-            assert response.status == 403
-        assert server.backend.estops == []
         async with http.post(server.url + "estop", headers={"Origin": server.url.rstrip("/")}) as response:
             assert response.status == 204
         await driver.wait_for(lambda c: c.session["estop"])
