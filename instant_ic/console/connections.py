@@ -187,14 +187,10 @@ class Listener:
         """
         loop = asyncio.get_running_loop()
         found = await loop.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)
-        try:
-            for family, address in dict.fromkeys((entry[0], entry[4]) for entry in found):
-                listener = socket.create_server(address[:2], family=socket.AddressFamily(family), backlog=128)
-                listener.setblocking(False)
-                self._sockets.append(listener)
-        except OSError:
-            self._close_sockets()
-            raise
+        for family, address in dict.fromkeys((entry[0], entry[4]) for entry in found):
+            listener = socket.create_server(address[:2], family=socket.AddressFamily(family), backlog=128)
+            listener.setblocking(False)
+            self._sockets.append(listener)
         self._tasks = [asyncio.create_task(self._accept_forever(listener)) for listener in self._sockets]
         for task in self._tasks:
             task.add_done_callback(_report_end)
@@ -205,7 +201,9 @@ class Listener:
         for task in self._tasks:
             task.cancel()
         await asyncio.gather(*self._tasks, return_exceptions=True)
-        self._close_sockets()
+        for listener in self._sockets:
+            listener.close()
+        self._sockets = []
 
     def take_headers(self, newcomer: LimitedConnection, headers: bytes) -> None:
         """Admit a newcomer whose headers are complete, or refuse it."""
@@ -228,11 +226,6 @@ class Listener:
     def forget(self, connection: LimitedConnection) -> None:
         """Free the place of a connection that has ended."""
         self._connections.pop(connection, None)
-
-    def _close_sockets(self) -> None:
-        for listener in self._sockets:
-            listener.close()
-        self._sockets = []
 
     async def _accept_forever(self, listener: socket.socket) -> None:
         loop = asyncio.get_running_loop()

@@ -5,8 +5,8 @@ from __future__ import annotations
 import asyncio
 import json
 import time
-from collections import deque
-from dataclasses import replace
+from collections import Counter, deque
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 from aiohttp import web
@@ -22,52 +22,47 @@ FRAME_ORDER = (FrameKind.VIEW, FrameKind.PANORAMA, FrameKind.LAYERS, FrameKind.M
 PART_BYTES = 64 * 1024  # a larger frame of layers is sent in pieces: on a slow link it would hold up pongs for seconds
 
 
+@dataclass(eq=False)
 class PageSession:
     """Send queue of one client. Used on the server's loop only.
 
     Replies are sent in order. A text replaces a pending text of the same key, and a frame a pending frame of the
     same kind. The next frame of a kind is sent once the client has acknowledged the last one.
+
+    Attributes:
+        bucket: limits the client's messages.
+        cookie: cookie of the sign-in; the session ends with it. Empty without a sign-in, or for one by token.
+        closing: closing handshake, once the session has ended.
+        chokes: true if too many replies are pending, which means that the client does not read.
+        away: true if the page is hidden or its operator types.
+        renders: true if the page can render the virtual space by itself, once it has layers.
+        drawn: version of the layers that the page renders by itself, and time of the newest state that it has shown
+            (server's clock, ms); None: it needs rendered views.
     """
 
-    def __init__(
-        self,
-        number: int,
-        socket: web.WebSocketResponse,
-        connection: LimitedConnection,
-        bucket: TokenBucket,
-        may_drive: bool = True,
-        cookie: str = "",
-    ) -> None:
-        self.number = number
-        self.socket = socket
-        self.connection = connection
-        self.bucket = bucket
-        """Limits the client's messages."""
-        self.may_drive = may_drive
-        self.cookie = cookie
-        """Cookie of the sign-in; the session ends with it. Empty without a sign-in, or for one by token."""
-        self.closing: asyncio.Task[None] | None = None
-        """Closing handshake, once the session has ended."""
-        self.chokes = False
-        """True if too many replies are pending, which means that the client does not read."""
-        self.away = False
-        self.renders = False
-        """True if the page can render the virtual space by itself, once it has layers."""
-        self.drawn: tuple[int, float] | None = None
-        """Version of the layers that the page renders by itself, and time of the newest state that it has shown
-        (server's clock, ms); None: it needs rendered views."""
-        self._held: frozenset[str] = frozenset()  # digests of the layers that the page holds
-        self._offered: frozenset[str] = frozenset()  # of the layers sent last
-        self._replies: deque[str] = deque()
-        self._texts: dict[str, str] = {}
-        self._frames: dict[FrameKind, PendingFrame | PageLayers] = {}
-        self._sent_frames: dict[FrameKind, int] = dict.fromkeys(FrameKind, 0)
-        self._unacknowledged: dict[FrameKind, int] = {}
-        self._parts: deque[PageFrame] = deque()  # of the layers being sent; not numbered yet
-        self._last_sent: dict[FrameKind, float] = {}
-        self._foreground: frozenset[FrameKind] = frozenset({FrameKind.PANORAMA})
-        self._background_period_s = 0.0
-        self._wake = asyncio.Event()
+    number: int
+    socket: web.WebSocketResponse
+    connection: LimitedConnection
+    bucket: TokenBucket
+    may_drive: bool = True
+    cookie: str = ""
+    closing: asyncio.Task[None] | None = None
+    chokes: bool = False
+    away: bool = False
+    renders: bool = False
+    drawn: tuple[int, float] | None = None
+    _held: frozenset[str] = frozenset()  # digests of the layers that the page holds
+    _offered: frozenset[str] = frozenset()  # of the layers sent last
+    _replies: deque[str] = field(default_factory=deque)
+    _texts: dict[str, str] = field(default_factory=dict)
+    _frames: dict[FrameKind, PendingFrame | PageLayers] = field(default_factory=dict)
+    _sent_frames: Counter[FrameKind] = field(default_factory=Counter)
+    _unacknowledged: dict[FrameKind, int] = field(default_factory=dict)
+    _parts: deque[PageFrame] = field(default_factory=deque)  # of the layers being sent; not numbered yet
+    _last_sent: dict[FrameKind, float] = field(default_factory=dict)
+    _foreground: frozenset[FrameKind] = frozenset({FrameKind.PANORAMA})
+    _background_period_s: float = 0.0
+    _wake: asyncio.Event = field(default_factory=asyncio.Event)
 
     def reply(self, message: dict[str, Any]) -> None:
         """Queue an answer that must not be lost. If the queue is full, set ``chokes``; the session must then end."""
