@@ -37,6 +37,16 @@ class TopicSummary:
     qos: QoS
     schema: Schema = field(repr=False)
 
+    @property
+    def problem(self) -> str:
+        """Why nodes here cannot read its messages; empty where they can."""
+        own = schema_or_unknown(self.type_name)
+        if not own.encoding and self.schema.encoding != "ros2msg":
+            return "its type is unknown, and the bag has no definition of it"
+        if own.encoding and self.schema.type_hash not in ("", own.type_hash) and upgrade_of(self.schema) is None:
+            return "the bag defines its type differently"
+        return ""
+
 
 @dataclass(frozen=True)
 class PartSummary:
@@ -234,16 +244,6 @@ class BagReader(Closing):
             raise BagError(f"bag {self.path}, topic {topic.topic}: type {topic.type_name} is unknown")
         store = store_of(topic.schema)
         return lambda payload: store.deserialize_cdr(payload, topic.type_name)
-
-    def differing_types(self) -> list[str]:
-        """Return the types whose definition in the bag differs from ours and cannot be converted."""
-        found = set()
-        for topic in self.topics:
-            own = schema_or_unknown(topic.type_name)
-            differs = own.encoding and topic.schema.type_hash and topic.schema.type_hash != own.type_hash
-            if differs and upgrade_of(topic.schema) is None:
-                found.add(topic.type_name)
-        return sorted(found)
 
     # -- internals -------------------------------------------------------------------------------
 

@@ -13,8 +13,6 @@ from instant_ic.bag.choice import TopicChoice
 from instant_ic.bag.files import BagReader, TopicSummary
 from instant_ic.bag.latched import LatchedValues
 from instant_ic.bag.message import BagError, BagMessage
-from instant_ic.bag.metadata import schema_or_unknown
-from instant_ic.bag.upgrade import upgrade_of
 from instant_ic.bus.heartbeat import EVERY_NODES
 from instant_ic.config.ranges import Checked, NotNegative, Range
 
@@ -86,7 +84,7 @@ class BagPlayer:
         for topic in sorted(self._reader.topics, key=lambda topic: -topic.count):
             if topic.topic in NEVER_PLAYED or not choice.takes(topic.topic):
                 continue
-            if why := self._why_not(topic) or ("the topic also has another type" if topic.topic in chosen else ""):
+            if why := topic.problem or ("the topic also has another type" if topic.topic in chosen else ""):
                 self.left_out[f"{topic.topic} ({topic.type_name}, {topic.count} messages)"] = why
             else:
                 chosen[topic.topic] = topic
@@ -110,8 +108,9 @@ class BagPlayer:
         """Messages sent."""
         self.latest_s = 0.0
         """Lag of the latest message in seconds: positive when the machine or the receiver is slower than the bag."""
-        self._rate = options.rate
-        self._paused = options.start_paused
+        self.rate = options.rate
+        """Playback speed; 2 plays twice as fast."""
+        self.paused = options.start_paused
         self._steps = 0
         self._anchor_s = 0.0
         self._anchor_ns = self.start_ns
@@ -121,25 +120,7 @@ class BagPlayer:
     def close(self) -> None:
         self._reader.close()
 
-    def _why_not(self, topic: TopicSummary) -> str:
-        """Return why a topic cannot be sent; empty where it can."""
-        own = schema_or_unknown(topic.type_name)
-        if not own.encoding and topic.schema.encoding != "ros2msg":
-            return "its type is unknown, and the bag has no definition of it"
-        if own.encoding and topic.schema.type_hash not in ("", own.type_hash) and upgrade_of(topic.schema) is None:
-            return "the bag defines its type differently"
-        return ""
-
     # -- controls ----------------------------------------------------------------------------------
-
-    @property
-    def rate(self) -> float:
-        """Playback speed; 2 plays twice as fast."""
-        return self._rate
-
-    @property
-    def paused(self) -> bool:
-        return self._paused
 
     def set_rate(self, rate: float) -> None:
         """Change the playback speed.
@@ -151,15 +132,15 @@ class BagPlayer:
             raise ValueError(f"rate must lie in {RATES[0]:g}..{RATES[1]:g} (got {rate})")
         with self._lock:
             self._anchor(self.position_ns)
-            self._rate = rate
+            self.rate = rate
 
     def pause(self) -> None:
-        self._paused = True
+        self.paused = True
 
     def resume(self) -> None:
         with self._lock:
             self._anchor(self.position_ns)
-            self._paused = False
+            self.paused = False
 
     def step(self, count: int = 1) -> None:
         """Send the next ``count`` messages, then pause.
@@ -170,7 +151,7 @@ class BagPlayer:
         if count < 1:
             raise ValueError(f"count must be >= 1 (got {count})")
         with self._lock:
-            self._paused = True
+            self.paused = True
             self._steps += count
 
     def status(self) -> dict[str, Any]:
@@ -228,21 +209,21 @@ class BagPlayer:
                     return
                 now_s = self._now_s()
                 with self._lock:
-                    if self._steps and self._paused:
+                    if self._steps and self.paused:
                         self._steps -= 1
                         self._anchor(message.stamp_ns)
                         break
-                    due_s = self._anchor_s + (message.stamp_ns - self._anchor_ns) / 1e9 / self._rate
-                    if not self._paused:
+                    due_s = self._anchor_s + (message.stamp_ns - self._anchor_ns) / 1e9 / self.rate
+                    if not self.paused:
                         if now_s >= due_s:
                             self.latest_s = max(self.latest_s, now_s - due_s)
                             break
-                        at_ns = self._anchor_ns + int((now_s - self._anchor_s) * self._rate * 1e9)
+                        at_ns = self._anchor_ns + int((now_s - self._anchor_s) * self.rate * 1e9)
                         self.position_ns = min(max(self.position_ns, at_ns), message.stamp_ns)
                 if now_s >= next_clock_s:
                     next_clock_s = now_s + period_s
                     on_clock(self.position_ns)
-                stop.wait(period_s if self._paused else min(due_s - now_s, max(0.0, next_clock_s - now_s)))
+                stop.wait(period_s if self.paused else min(due_s - now_s, max(0.0, next_clock_s - now_s)))
             self.position_ns = max(self.position_ns, message.stamp_ns)
             send(message)
             self.sent += 1

@@ -175,12 +175,9 @@ def replay(
 
 
 def _check_types(reader: BagReader, bus: LockstepBus) -> None:
-    other = set(reader.differing_types())
     for topic in reader.topics:
-        if topic.type_name in other and bus.subscriptions.get(topic.topic):
-            raise ReplayError(
-                f"bag {reader.path}: {topic.topic} has type {topic.type_name} defined differently than here"
-            )
+        if topic.problem and bus.subscriptions.get(topic.topic):
+            raise ReplayError(f"bag {reader.path}, topic {topic.topic} ({topic.type_name}): {topic.problem}")
 
 
 def _feed(

@@ -190,7 +190,7 @@ def test_type_of_another_definition_is_refused(tmp_path: Path) -> None:
     theirs = with_hash(Schema("sensor_msgs/msg/LaserScan", "ros2msg", "uint8 number\n", ""))
     with BagWriter(tmp_path / "bag") as writer:
         writer.write("/scan", theirs.name, b"\x00\x01\x00\x00\x2a", START_NS, SENSOR, theirs)
-    with pytest.raises(ReplayError, match="/scan has type sensor_msgs/msg/LaserScan defined differently than here"):
+    with pytest.raises(ReplayError, match=r"/scan \(sensor_msgs/msg/LaserScan\): the bag defines its type differently"):
         replay(tmp_path / "bag", [mean_node()], tmp_path / "out")
 
 

@@ -567,11 +567,11 @@ def _read_bag(path: Path) -> None:
 
     with BagReader(path) as bag:
         for topic in bag.topics:
+            _ = topic.problem
             try:
                 bag.decoder(topic)
             except BagError:
                 continue
-        bag.differing_types()
         for _ in bag.messages():
             pass
 
