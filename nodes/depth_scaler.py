@@ -8,11 +8,10 @@ from typing import Any
 
 from instant_ic.adapters.depth import held_image, keyframe_message, revolution_of
 from instant_ic.bus import LATCHED, OK, SENSOR, WARN, Node, NodeError, main
-from instant_ic.depth.chain import DepthChain
+from instant_ic.depth.chain import DepthChain, DepthScalerConfig
 from instant_ic.depth.inference import Floats, Inference
 from instant_ic.depth.inputs import HeldImage
 from instant_ic.depth.manifest import ManifestError
-from instant_ic.depth.metric_depth import DepthScalerConfig
 from instant_ic.depth.sources import DepthResult, complete
 from instant_ic.mapping.local_model import warm_up
 from instant_ic.msg import (
@@ -95,7 +94,7 @@ class DepthScalerNode(Node[DepthScalerConfig]):
         self.handle(self.chain.add_revolution(revolution))
 
     def on_local_map(self) -> None:
-        mapper = self.chain.metric.mapper
+        mapper = self.chain.mapper
         if self.local_map.subscriber_count and mapper.model.revolutions:
             self.local_map.publish(cloud_of_points(mapper.cloud(), "map", self.chain.image_ns))
 
@@ -109,7 +108,7 @@ class DepthScalerNode(Node[DepthScalerConfig]):
         if image is None:
             return
         result = self.chain.estimate(raw, image)
-        panorama = self.chain.inputs.images.get(image.stamp_ns)
+        panorama = self.chain.images.get(image.stamp_ns)
         if result.prior is None or panorama is None:
             self.publish_depth((image, result))
         else:
@@ -128,7 +127,7 @@ class DepthScalerNode(Node[DepthScalerConfig]):
         pose = self.chain.keyframe_pose(result, image)
         if pose is None:
             return
-        panorama, count = self.chain.inputs.images[image.stamp_ns], self.chain.selector.count
+        panorama, count = self.chain.images[image.stamp_ns], self.chain.selector.count
         self.keyframe.publish(keyframe_message(count, "map", pose, panorama, result))
         text, level = f"keyframe {count}: {result.message}", OK if result.ok else WARN
         before = self.diagnoses().get("keyframe", (OK,))[0]

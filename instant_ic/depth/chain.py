@@ -2,48 +2,97 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable
-from dataclasses import replace
-from typing import Any
+from dataclasses import dataclass, field, replace
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from instant_ic.depth.inputs import KEEP_NS, DepthRequests, HeldImage, RecentInputs, RevolutionTrigger
-from instant_ic.depth.keyframes import KeyframeSelector
-from instant_ic.depth.metric_depth import DepthScalerConfig, MetricDepth
-from instant_ic.depth.sources import DepthResult
+from instant_ic.config.ranges import Positive, PositiveInt, Range
+from instant_ic.depth.inputs import KEEP_NS, MAX_CLOUD_AGE_S, DepthRequests, HeldImage, RevolutionTrigger
+from instant_ic.depth.keyframes import KeyframeSelectionConfig, KeyframeSelector
+from instant_ic.depth.model import DEFAULT_COMPLETION
+from instant_ic.depth.sources import DepthResult, DepthSource, SourceConfig, without_body
 from instant_ic.geometry.poses import Matrix
 from instant_ic.geometry.transforms import TransformBuffer, TransformError
-from instant_ic.lidar.deskew import TimedPoints
+from instant_ic.lidar.deskew import TimedPoints, points_at
+from instant_ic.mapping.mapper import LocalMapper, LocalView, MapperConfig, correction
 from instant_ic.util.diagnosis import Level
 
-_SILENT_S = 10.0  # without an answer to any request
+_MAX_IMAGES, _MAX_REVOLUTIONS = 150, 40
+_SILENT_S = 10.0
+"""The node warns after this time without an answer to any request."""
+
+
+@dataclass(frozen=True)
+class DepthScalerConfig(SourceConfig):
+    """Parameters of the node ``depth_scaler``.
+
+    Attributes:
+        completion: completion model for ``completed``: ONNX file; a bare name is searched for in ``models/``.
+        provider, threads: execution provider and CPU threads of the completion.
+        keyframes: selection of keyframes.
+        mapping: the local 3D model, from which all sources but ``network`` take depth first.
+        max_rate_hz: highest rate of the source ``lidar``, by the images' stamps; that of the others is
+            depth_estimator's.
+        rows: height of the depth image of source ``lidar``; the others have the network's.
+        body_elevation_deg: below this elevation the image shows the robot itself, not the room; -90: nowhere.
+    """
+
+    source: str = "completed"
+    completion: str = DEFAULT_COMPLETION
+    provider: str = "auto"
+    threads: PositiveInt = 1
+    keyframes: KeyframeSelectionConfig = field(default_factory=KeyframeSelectionConfig)
+    mapping: MapperConfig = field(default_factory=MapperConfig)
+    max_rate_hz: Positive = 2.0
+    rows: Annotated[int, Range(32, 1024)] = 256
+    body_elevation_deg: Annotated[float, Range(-90, 0)] = -70.0
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.source == "completed" and not self.completion:
+            raise ValueError("source completed needs a model: set completion to a file of ic depth train --export")
 
 
 class DepthChain:
-    """Keeps recent inputs, decides of which images to compute the depth, and which of them become keyframes.
+    """Keeps recent inputs, computes the depth of images that may become keyframes, and selects the keyframes.
 
     Args:
         config: parameters.
         transforms: poses over time.
         diagnose: sets a diagnosis: name, level, text, values by keyword.
+
+    Attributes:
+        images: recent images by their stamp.
+        image_ns: stamp of the newest image.
+        requests: requests for the network's depth.
+        selector: selection of keyframes.
+        source: computes depth.
+        mapper: the local 3D model.
     """
 
     def __init__(self, config: DepthScalerConfig, transforms: TransformBuffer, diagnose: Callable[..., None]) -> None:
-        self.config, self.inputs, self.selector = config, RecentInputs(), KeyframeSelector(config.keyframes)
-        self._diagnose = diagnose
-        self._trigger, self.requests = RevolutionTrigger(), DepthRequests()
+        self.config = config
+        self.images: dict[int, Any] = {}
+        self.image_ns = 0
+        self.requests, self.selector = DepthRequests(), KeyframeSelector(config.keyframes)
+        self.source, self.mapper = DepthSource(config), LocalMapper(transforms, config.mapping)
+        self._transforms, self._diagnose = transforms, diagnose
+        self._trigger = RevolutionTrigger()
+        self._revolutions: deque[TimedPoints] = deque(maxlen=_MAX_REVOLUTIONS)
         self._model: tuple[str, str] | None = None
         self._last_ns: int | None = None  # stamp of the newest depth
-        self.image_ns = 0  # stamp of the newest image
-        self.metric = MetricDepth(config, transforms, self.inputs)
 
     def reconfigure(self, config: DepthScalerConfig) -> None:
-        """Apply new parameters."""
-        self.config, self.selector.config = config, config.keyframes
-        self.metric.reconfigure(config)
-        self._trigger.clear()
+        """Apply new parameters; the local model starts again if they change it."""
+        before, self.config, self.selector.config = self.config, config, config.keyframes
+        self.source.configure(config)
+        if before.mapping != config.mapping:
+            self.mapper = LocalMapper(self._transforms, config.mapping)
+        self._trigger = RevolutionTrigger()
         if self._model is not None:
             self.adopt(*self._model)
 
@@ -54,23 +103,30 @@ class DepthChain:
             scaler = replace(self.config.scaler, output_kind=output_kind)
         except ValueError as error:
             return self._diagnose("model", Level.WARN, f"{name}: {error}")
-        self.metric.source.configure(replace(self.config, scaler=scaler))
+        self.source.configure(replace(self.config, scaler=scaler))
         self._diagnose("model", Level.OK, f"{name}: {output_kind} depth")
 
     def add_image(self, image: HeldImage, message: Any) -> float:
-        """Keep an image; returns the seconds by which time went back at it: above 0, the keyframes start again."""
+        """Keep an image; return the seconds by which time went back. Above 0, the keyframes start again."""
         back_s = (self.image_ns - image.stamp_ns) / 1e9
         if restarts := image.stamp_ns < self.image_ns - KEEP_NS:
             self.selector.restart()
         self.image_ns = image.stamp_ns
-        self.inputs.add_image(image.stamp_ns, message)
-        self.inputs.discard(self.requests.since_ns or image.stamp_ns)
+        self.images[image.stamp_ns] = message
+        if len(self.images) > _MAX_IMAGES:
+            del self.images[next(iter(self.images))]
+        # Also what lies ahead is discarded: the clock may have gone back.
+        kept_ns = self.requests.since_ns or image.stamp_ns
+        for old in [other for other in self.images if abs(other - kept_ns) > KEEP_NS]:
+            del self.images[old]
+        while self._revolutions and abs(self._revolutions[0].stamp_ns - kept_ns) > KEEP_NS:
+            self._revolutions.popleft()
         return back_s if restarts else 0.0
 
     def due(self, image: HeldImage) -> bool:
         """Return whether a keyframe could be taken of the image."""
         try:
-            due = self.selector.due(self.metric.map_from_camera(image.frame, image.stamp_ns), image.stamp_ns)
+            due = self.selector.due(self.map_from_camera(image), image.stamp_ns)
         except TransformError as error:
             self._diagnose("pose", Level.WARN, f"no keyframe without a pose: {error}")
             return False
@@ -78,7 +134,7 @@ class DepthChain:
         return due
 
     def hold(self, image: HeldImage) -> HeldImage | None:
-        """Hold an image until the revolution around it is complete; returns an earlier one without a revolution."""
+        """Hold an image until the revolution around it is complete; return an earlier one that got none."""
         return self._trigger.image(image, self._last_ns, self.config.max_rate_hz)
 
     def request_due(self, stamp_ns: int) -> bool:
@@ -92,32 +148,82 @@ class DepthChain:
         return True
 
     def add_revolution(self, revolution: TimedPoints) -> HeldImage | None:
-        """Add a revolution to the local model; returns the held image that it completes."""
+        """Add a revolution to the local model; return the held image that it completes."""
         self._diagnose("points", Level.OK, f"{len(revolution.time_s)} points")
-        self.inputs.revolutions.append(revolution)
+        self._revolutions.append(revolution)
         if self.config.source != "network":
-            mapper = self.metric.mapper
             try:
-                mapper.revolution(revolution)
-                self._diagnose("local model", Level.OK, "growing", revolutions=mapper.model.revolutions)
+                self.mapper.revolution(revolution)
+                self._diagnose("local model", Level.OK, "growing", revolutions=self.mapper.model.revolutions)
             except (TransformError, ValueError) as error:
                 self._diagnose("local model", Level.WARN, f"no points added: {error}")
         return self._trigger.revolution(revolution.middle_ns)
 
     def estimate(self, raw: NDArray[np.float32] | None, image: HeldImage) -> DepthResult:
-        """Estimate the depth of an image; ``raw``: the network's, (H, W), if the source needs it."""
-        self._last_ns = image.stamp_ns
-        return self.metric.estimate(raw, image.frame, image.stamp_ns)
+        """Estimate the depth of an image; if something is missing the result is not ok, and its message says what.
+
+        Args:
+            raw: the network's depth, (H, W); None for the source ``lidar``.
+            image: the image.
+        """
+        self._last_ns, size = image.stamp_ns, (self.config.rows, 2 * self.config.rows)
+        try:
+            up, height_m = self._camera_stance(image)
+            if raw is not None and self.source.config.scaler.method == "as_estimated":
+                # Not masked: a camera at another place has another height.
+                return self.source.estimate(raw, np.empty((0, 3)), up, height_m, size=size)
+            points, local = self._points_in_camera(image), None
+            if self.source.config.source != "network":
+                local = LocalView(self.mapper.model, self.mapper.model_from_camera(image.frame, image.stamp_ns))
+        except TransformError as error:
+            return self.source.refuse(raw, str(error), size)
+        if points is None:
+            return self.source.refuse(raw, f"no LiDAR revolution within {MAX_CLOUD_AGE_S} s", size)
+        result = self.source.estimate(raw, points, up, height_m, size=size, local=local)
+        return without_body(result, up, height_m, self.config.body_elevation_deg)
+
+    def _camera_stance(self, image: HeldImage) -> tuple[NDArray[np.float64], float]:
+        """Return the up direction in the camera's frame (odometry is level) and the camera's height over the ground."""
+        base_from_camera = self._transforms.lookup("base_link", image.frame, image.stamp_ns)
+        odom_from_camera = self._transforms.lookup("odom", image.frame, image.stamp_ns)
+        return np.array(odom_from_camera[2, :3]), float(base_from_camera[2, 3])
+
+    def _points_in_camera(self, image: HeldImage) -> NDArray[np.float64] | None:
+        """Return the nearest revolution in the camera's frame, motion-compensated, (N, 3); None without one."""
+
+        def gap_ns(revolution: TimedPoints) -> int:
+            return abs(revolution.middle_ns - image.stamp_ns)
+
+        revolution = min((one for one in self._revolutions if len(one.time_s)), key=gap_ns, default=None)
+        if revolution is None or gap_ns(revolution) / 1e9 > MAX_CLOUD_AGE_S:
+            return None
+        lidar, camera_from_odom = revolution.frame, self._transforms.lookup(image.frame, "odom", image.stamp_ns)
+
+        def camera_from_lidar(at_ns: int) -> Matrix:
+            return camera_from_odom @ self._transforms.lookup("odom", lidar, at_ns)
+
+        return points_at(revolution.xyz(), revolution.time_s, revolution.stamp_ns, camera_from_lidar)
+
+    def map_from_camera(self, image: HeldImage) -> Matrix:
+        """Return the camera's pose from odometry and its correction at the image's time.
+
+        Tracks slip in a turn: one second later the correction differs by degrees.
+
+        Raises:
+            TransformError: the poses are not known.
+        """
+        odom_from_camera = self._transforms.lookup("odom", image.frame, image.stamp_ns)
+        return correction(self._transforms, image.stamp_ns) @ odom_from_camera
 
     def report(self, result: DepthResult) -> None:
         self._diagnose("scale", Level.OK if result.ok else Level.WARN, result.message, **result.figures())
 
     def keyframe_pose(self, result: DepthResult, image: HeldImage) -> Matrix | None:
         """Return map_from_camera of a new keyframe; None if this image does not become one."""
-        if image.stamp_ns not in self.inputs.images:
+        if image.stamp_ns not in self.images:
             return self._diagnose("keyframe", Level.WARN, "the image that this depth belongs to did not arrive")
         try:
-            map_from_camera = self.metric.map_from_camera(image.frame, image.stamp_ns)
+            map_from_camera = self.map_from_camera(image)
         except TransformError as error:
             return self._diagnose("keyframe", Level.WARN, f"no pose: {error}")
         return map_from_camera if self.selector.take(map_from_camera, result.ok, image.stamp_ns) else None

@@ -1,50 +1,14 @@
-"""Images and LiDAR revolutions of the last seconds: which of them belong together."""
+"""Choice of the images whose depth is computed, and when."""
 
 from __future__ import annotations
 
-from collections import deque
 from dataclasses import dataclass
-from typing import Any
-
-from instant_ic.lidar.deskew import TimedPoints
 
 KEEP_NS = 4_000_000_000
 """Images and revolutions that differ more from the newest depth are discarded."""
 MAX_CLOUD_AGE_S = 0.3
-"""Largest difference between an image and the middle of its revolution; so long, by the stamps, an image is held."""
-_MAX_IMAGES = 150
-_MAX_REVOLUTIONS = 40
+"""Longest time between an image and the middle of its revolution. An image is held this long, by the stamps."""
 _REPEAT_NS = 2_000_000_000
-
-
-class RecentInputs:
-    """Images by their stamp, and revolutions."""
-
-    def __init__(self) -> None:
-        self.images: dict[int, Any] = {}
-        self.revolutions: deque[TimedPoints] = deque(maxlen=_MAX_REVOLUTIONS)
-
-    def add_image(self, stamp_ns: int, image: Any) -> None:
-        """Keep an image; the oldest one goes when there are too many."""
-        self.images[stamp_ns] = image
-        if len(self.images) > _MAX_IMAGES:
-            del self.images[next(iter(self.images))]
-
-    def nearest_revolution(self, stamp_ns: int) -> TimedPoints | None:
-        """Return the revolution whose middle is nearest in time; None if none is within ``MAX_CLOUD_AGE_S``."""
-
-        def gap_ns(revolution: TimedPoints) -> int:
-            return abs(revolution.middle_ns - stamp_ns)
-
-        found = min((one for one in self.revolutions if len(one.time_s)), key=gap_ns, default=None)
-        return found if found is not None and gap_ns(found) / 1e9 <= MAX_CLOUD_AGE_S else None
-
-    def discard(self, stamp_ns: int) -> None:
-        """Discard what lies more than ``KEEP_NS`` from a time, also ahead of it: the clock may have gone back."""
-        for old in [other for other in self.images if abs(other - stamp_ns) > KEEP_NS]:
-            del self.images[old]
-        while self.revolutions and abs(self.revolutions[0].stamp_ns - stamp_ns) > KEEP_NS:
-            self.revolutions.popleft()
 
 
 @dataclass(frozen=True)
@@ -62,7 +26,7 @@ class RevolutionTrigger:
         self._held: HeldImage | None = None
 
     def image(self, image: HeldImage, last_ns: int | None, max_rate_hz: float) -> HeldImage | None:
-        """Take a new image; returns a held one for which no revolution arrived.
+        """Take a new image; return a held one for which no revolution arrived.
 
         Args:
             image: the new one.
@@ -86,10 +50,6 @@ class RevolutionTrigger:
             return None
         image, self._held = self._held, None
         return image
-
-    def clear(self) -> None:
-        """Drop the held image."""
-        self._held = None
 
 
 class DepthRequests:

@@ -57,7 +57,7 @@ def test_navigator(bus):
 def test_depth_scaler(bus):
     node = bus.add(node_class("depth_scaler"))
     node.parameters.set({"scaler.min_points": 400, "keyframes.distance_m": 1.5})
-    assert node.chain.metric.source.config.scaler.min_points == 400 and node.chain.selector.config.distance_m == 1.5
+    assert node.chain.source.config.scaler.min_points == 400 and node.chain.selector.config.distance_m == 1.5
 
 
 def test_grid_slam(bus):

@@ -179,7 +179,7 @@ def test_the_local_model_grows_is_published_on_demand_and_starts_again() -> None
         node = bus.add(DepthScalerNode)
         drive(bus, 3.0)
         assert not bus.messages("/map/local")  # nobody subscribes
-        grown = node.chain.metric.mapper.model.revolutions
+        grown = node.chain.mapper.model.revolutions
         assert 5 <= grown <= 9  # 1.2 m, one in 0.15 m
         assert level(node, "local model") == (0, "growing")
         bus.add(Viewer)
@@ -193,7 +193,7 @@ def test_the_local_model_grows_is_published_on_demand_and_starts_again() -> None
         assert level(node, "points") == (1, "/lidar/points cannot be used: no field of name time")
         node.on_cloud(cloud_message(np.zeros(5, POINT_DTYPE), "velodyne", START))
         assert level(node, "local model")[0] == 1 and "time went back" in level(node, "local model")[1]
-        assert node.chain.metric.mapper.model.revolutions == 0
+        assert node.chain.mapper.model.revolutions == 0
 
 
 def test_scaler_scales_and_makes_keyframes() -> None:
