@@ -1,18 +1,13 @@
 """Behaviour that all commands of ``ic`` share; ``ic launch``, ``ic run`` and ``ic replay`` on the command line."""
 
 import os
-import shutil
-import signal
 import subprocess
 import sys
-import time
 from importlib import metadata
 from pathlib import Path
 
 import pytest
-from cli_helpers import TALKER
 
-from instant_ic.bus import registry
 from instant_ic.cli.main import build_parser
 
 
@@ -48,40 +43,6 @@ def test_help_loads_nothing_heavy():
     )
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=60)
     assert result.stdout.strip() == "[]"
-
-
-def test_launch_in_a_process_ends_in_time_and_leaves_nothing(tmp_path, tmp_path_factory):
-    shutil.copy(TALKER, tmp_path / "talker.py")
-    (tmp_path / "two.yaml").write_text(
-        "launch:\n"
-        "- arg: {name: rate, default: 20.0, description: how often}\n"
-        "- node: {exec: talker.py, name: first, param: [{name: rate_hz, value: $(var rate)}],"
-        " remap: [{from: /scan, to: /one}]}\n"
-        "- node: {exec: talker.py, name: second, remap: [{from: /scan, to: /two}]}\n"
-    )
-    run_dir = tmp_path_factory.mktemp("r")  # short: sockets are bound in it
-    command = [sys.executable, "-m", "instant_ic.cli.main", "launch", "two.yaml", "rate:=30", "--run-dir", str(run_dir)]
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
-    lines = []
-    try:
-        for line in process.stdout:
-            lines.append(line)
-            if "all 2 nodes are up" in line:
-                break
-        nodes = {node.name: node for node in registry.list_nodes(run_dir)}
-        assert nodes["first"].params["rate_hz"] == 30 and "/one" in nodes["first"].publishes
-        assert "/two" in nodes["second"].publishes
-        began_s = time.monotonic()
-        process.send_signal(signal.SIGINT)
-        rest, _ = process.communicate(timeout=30)
-        assert time.monotonic() - began_s < 25  # 5 s, and the patience of a busy machine
-    finally:
-        process.kill()
-    assert process.returncode == 0, "".join(lines) + rest
-    assert "stopping 2 nodes" in rest
-    assert registry.list_nodes(run_dir) == [] and registry.list_topics(run_dir) == []
-    assert not any(Path(f"/proc/{node.pid}").exists() for node in nodes.values())
-    assert "running" in (run_dir / "log" / "first.log").read_text()
 
 
 def test_launch_mistakes(ic):

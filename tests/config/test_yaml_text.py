@@ -13,7 +13,6 @@ from instant_ic.bag.metadata import profiles_of
 from instant_ic.config.params import ParameterError, load_sections
 from instant_ic.config.yaml_text import compose_yaml, read_yaml
 from instant_ic.depth.manifest import ManifestError, load_manifest
-from instant_ic.launch import LaunchFileError, read_launch_file
 from instant_ic.slam.map_files import MapError, load_grid
 
 # 9 ** 9 values: each list holds the one before nine times.
@@ -71,22 +70,6 @@ def test_depth_counts_through_aliases() -> None:
     text = f"[&a {'[' * 60}{']' * 60}, &b {'[' * 30}*a{']' * 30}, {'[' * 30}*b{']' * 30}]"
     with pytest.raises(yaml.YAMLError, match="too deeply"):
         read_yaml(text)
-
-
-@pytest.mark.parametrize(
-    ("text", "why"),
-    [
-        ("- node: {exec: arbiter, param: [{name: a, value: " + BOMB + "}]}", MANY),
-        ("- node: {exec: arbiter, param: [{name: a, value: &a [*a]}]}", "contains itself"),
-        ("- " + "{group: [" * 300 + "]}" * 300, "nested too deeply"),
-        ("- let: {name: a, value: $(eval " + "(" * 400 + "1" + ")" * 400 + ")}", "2: .* too many nested parentheses"),
-        ("- let: {name: a, value: " + "$(var " * 600 + "1" + ")" * 600 + "}", "2: unknown variable"),
-    ],
-)
-def test_launch_file(tmp_path: Path, text: str, why: str) -> None:
-    (tmp_path / "l.yaml").write_text(f"launch:\n{text}\n")
-    with pytest.raises(LaunchFileError, match=why):
-        read_launch_file(tmp_path / "l.yaml", {}, tmp_path)
 
 
 def test_metadata_of_a_bag(tmp_path: Path, key: str = "custom_data") -> None:

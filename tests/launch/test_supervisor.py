@@ -164,12 +164,6 @@ def test_the_end_of_a_required_node_ends_the_stack(run_dir: Path, code: str, sta
     assert output.events[1] == "stopping 1 node"
 
 
-def test_failure_of_a_node_that_is_not_required_is_reported(run_dir: Path) -> None:
-    output = Recorder(lambda self, _: bool(self.events))
-    assert supervise(run_dir, [program("other", SLEEPER), program("bad", "import os; os.abort()")], output) == 0
-    assert output.events[0] == f"bad ended (killed by SIGABRT), see {run_dir}/log/bad.log"
-
-
 def test_states_and_status_of_a_stack_that_has_ended(run_dir: Path) -> None:
     output = Recorder()
     ghost = NodeSpec("ghost", "ghost", ("/no/such/program",))
@@ -179,6 +173,7 @@ def test_states_and_status_of_a_stack_that_has_ended(run_dir: Path) -> None:
     states = [(p.state, p.exit_status) for p in output.supervisor.processes]
     assert states == [(ProcessState.ENDED, 0), *((ProcessState.FAILED, status) for status in (3, 1, 127))]
     assert any("FileNotFoundError" in line for line in output.of("ghost"))
+    assert f"bad ended (exit status 3), see {run_dir}/log/bad.log" in output.events
     assert "odd cannot be started: embedded null byte" in output.events
 
 
