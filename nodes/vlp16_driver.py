@@ -15,7 +15,7 @@ from instant_ic.lidar.flatscan import check_level, compensated_scan, warm_up
 from instant_ic.lidar.motion import base_pose
 from instant_ic.lidar.packets import DATA_PACKET_BYTES
 from instant_ic.lidar.player import CapturePlayer
-from instant_ic.lidar.receiver import PacketReceiver, ReceiverError, ReceiverThread, SensorDatagram
+from instant_ic.lidar.receiver import PacketReceiver, ReceiverError, SensorDatagram
 from instant_ic.lidar.report import LidarReport
 from instant_ic.lidar.stream import Revolution
 from instant_ic.msg import LaserScan, PointCloud2, VelodyneScan, cloud_message, stamp_ns
@@ -31,7 +31,7 @@ class Vlp16DriverNode(Node[Vlp16DriverConfig]):
     def setup(self) -> None:
         config = self.config
         warm_up()
-        self.thread: ReceiverThread | None = None
+        self.receiver: PacketReceiver | None = None
         self.feed = PacketFeed(config.decoder, config.sensor, self.clock.steady_ns())
         self.report = LidarReport(self.feed)
         self.cover = CoverWatch()
@@ -59,8 +59,7 @@ class Vlp16DriverNode(Node[Vlp16DriverConfig]):
                 self.receiver = PacketReceiver(config, self.feed.sources, self.clock.steady_ns)
             except ReceiverError as error:
                 raise NodeError(str(error)) from error
-            self.thread = ReceiverThread(self.receiver, self.on_datagram, self.on_fault)
-            self.thread.start()
+            self.receiver.start(self.on_datagram, self.on_fault)
 
     def on_fault(self, error: Exception) -> None:
         self.call_soon(self.callbacks.fault, "receiver", error)
@@ -110,7 +109,7 @@ class Vlp16DriverNode(Node[Vlp16DriverConfig]):
 
     def hand_on(self, revolution: Revolution, packets: Packets) -> None:
         """Pass a revolution and its packets to the node's thread."""
-        if self.thread is None:
+        if self.receiver is None:
             self.on_revolution(revolution, packets)
         elif self.waiting >= _MAX_WAITING:
             self.report.skipped += 1
@@ -120,7 +119,7 @@ class Vlp16DriverNode(Node[Vlp16DriverConfig]):
 
     def on_revolution(self, revolution: Revolution, packets: Packets) -> None:
         config = self.config
-        if self.thread is not None:
+        if self.receiver is not None:
             self.waiting -= 1
         if self.packets is not None and (self.lockstep or self.packets.subscriber_count):
             self.packets.publish(packets_message(packets, revolution, config.frame_id))
@@ -137,12 +136,12 @@ class Vlp16DriverNode(Node[Vlp16DriverConfig]):
     def check(self) -> None:
         """Report silence and losses; each second."""
         config = self.config
-        where = f"{config.host}:{self.receiver.port}" if config.source == "udp" else config.pcap
+        where = f"{config.host}:{self.receiver.port}" if self.receiver is not None else config.pcap
         self.diagnose_all(*self.report.check(self.clock.steady_ns(), config.silence_s, config.source, where))
 
     def teardown(self) -> None:
-        if (thread := getattr(self, "thread", None)) is not None:
-            thread.end()
+        if (receiver := getattr(self, "receiver", None)) is not None:
+            receiver.close()
 
 
 if __name__ == "__main__":

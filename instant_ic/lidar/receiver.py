@@ -90,6 +90,8 @@ class PacketReceiver(Closing):
         self._steady_ns = steady_ns
         self._selector = selectors.DefaultSelector()
         self._sockets: list[socket.socket] = []
+        self._ending = threading.Event()
+        self._thread: threading.Thread | None = None
         try:
             self.port = self._bind(config.host, config.port, is_data=True)
             position = config.position_port
@@ -98,7 +100,29 @@ class PacketReceiver(Closing):
             self.close()
             raise
 
+    def start(self, on_datagram: Callable[[SensorDatagram], None], on_fault: Callable[[Exception], None]) -> None:
+        """Read on a thread of its own until :meth:`close`.
+
+        Args:
+            on_datagram: called on that thread with each datagram.
+            on_fault: called on that thread with the exception that ended it.
+        """
+
+        def run() -> None:
+            try:
+                while not self._ending.is_set():
+                    for received in self.read(timeout_s=0.2):
+                        on_datagram(received)
+            except Exception as error:  # noqa: BLE001 - nothing else reports what ends a thread
+                on_fault(error)
+
+        self._thread = threading.Thread(target=run, name="vlp16 receiver", daemon=True)
+        self._thread.start()
+
     def close(self) -> None:
+        self._ending.set()
+        if self._thread is not None:
+            self._thread.join(2.0)
         for bound in self._sockets:
             bound.close()
         self._selector.close()
@@ -135,41 +159,6 @@ class PacketReceiver(Closing):
             ) from error
         self._selector.register(bound, selectors.EVENT_READ, is_data)
         return int(bound.getsockname()[1])
-
-
-class ReceiverThread(threading.Thread):
-    """Thread that reads a receiver.
-
-    Args:
-        receiver: closed at the end.
-        on_datagram: called on this thread with each datagram.
-        on_fault: called on this thread with the exception that ended it.
-    """
-
-    def __init__(
-        self,
-        receiver: PacketReceiver,
-        on_datagram: Callable[[SensorDatagram], None],
-        on_fault: Callable[[Exception], None],
-    ) -> None:
-        super().__init__(name="vlp16 receiver", daemon=True)
-        self.receiver = receiver
-        self._on_datagram = on_datagram
-        self._on_fault = on_fault
-        self.ending = threading.Event()
-
-    def run(self) -> None:
-        try:
-            while not self.ending.is_set():
-                for received in self.receiver.read(timeout_s=0.2):
-                    self._on_datagram(received)
-        except Exception as error:  # noqa: BLE001 - nothing else reports what ends a thread
-            self._on_fault(error)
-
-    def end(self) -> None:
-        self.ending.set()
-        self.join(2.0)
-        self.receiver.close()
 
 
 def _stamp_ns(ancillary: list[tuple[int, int, bytes]]) -> int:
