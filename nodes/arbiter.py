@@ -55,7 +55,7 @@ class ArbiterNode(Node[ArbiterConfig]):
         points = self.latest("/lidar/points", msg.PointCloud2, 10.0) if c.costmap.points.enabled else None
         shown = Latest(self.clock, 1.0)
         vspace = self.latest("/vspace/status", msg.VspaceStatus, 60.0, qos=LATCHED)
-        # A doubt holds until the next report: silence is no trust. A SLAM that is gone is noticed by the age of /pose.
+        # A doubt holds until the next report. The age of /pose shows a SLAM that is gone.
         integrity = self.latest("/slam/integrity", msg.PoseIntegrity, float("inf"))
         self.inbox = ArbiterInbox(self.clock, self.surroundings, self.view, sources, points, shown, vspace, integrity)
         self.inbox.gate.limits = command_limits(c.timeouts)

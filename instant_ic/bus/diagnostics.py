@@ -60,7 +60,7 @@ class Diagnostics:
         self.present[name] = (ERROR, masked(f"{type(error).__name__}: {error}"), {"faults": count})
 
     def end_start_grace(self) -> None:
-        """Log what is still wrong at the end of the start-up grace period, at its own level."""
+        """Log the diagnoses that are still wrong after the start-up grace period, at their own levels."""
         for name in sorted(self._waiting) if time.monotonic() >= self._calm_until_s else ():
             self._waiting.discard(name)
             level, text, _ = self.present[name]

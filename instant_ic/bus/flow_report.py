@@ -1,6 +1,6 @@
 """Diagnoses of a node's topics: messages lost, refused, overwritten, or sent without shared memory.
 
-The counts of a topic only grow. A warning is what has grown lately: what was lost while the stack started is none.
+The counts of a topic only grow. A recent rise is a warning, except while the stack starts.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ class FlowReport:
         self._recent: WeakKeyDictionary[Stats, dict[str, RecentCount]] = WeakKeyDictionary()
 
     def input(self, topic: str, stats: Stats, values: Mapping[str, Any], now_ns: int) -> Iterator[Diagnosis]:
-        """Report what a subscription did not get; nothing where it has got everything.
+        """Report the messages that a subscription did not get; yield nothing if it got all.
 
         Args:
             topic: name of the topic.
@@ -56,7 +56,7 @@ class FlowReport:
             yield _diagnosis(f"input {topic}", level, texts, {"lost": stats.lost, **totals, **values})
 
     def output(self, topic: str, stats: PublisherStats, now_ns: int) -> Iterator[Diagnosis]:
-        """Report large messages that a publisher sent without shared memory; nothing where there were none."""
+        """Report large messages that a publisher sent without shared memory; yield nothing if there were none."""
         count = self._rise(stats, "not_shared", stats.not_shared, now_ns)
         texts = [f"{count} large messages without shared memory: {stats.not_shared_why}"] if count else []
         if stats.not_shared:

@@ -184,7 +184,7 @@ class LocalSubscription:
         if payload is None:
             return
         node, steady, order = source.node, self._steady_ns(), self._next_order()
-        # A publisher's type is that of the subscription, or what the registry says.
+        # The type is the subscription's, or the registry's if the subscription accepts any.
         message = _new(
             Received,
             (self.topic, source.type_name, payload, publish_ns, self._now_ns(), order, node, steady, publisher),

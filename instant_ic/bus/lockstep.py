@@ -219,7 +219,7 @@ class LockstepBus(Closing):
         return deserialize(records[-1].payload, records[-1].type_name) if records else None
 
     def kill(self, node: Node[Any]) -> None:
-        """Remove a node as SIGKILL does: no teardown, and nobody gets its latched values any more."""
+        """Remove a node as SIGKILL does: no teardown, and its latched values are gone."""
         self.nodes.remove(node)
         transport = self._transports.pop(node)
         for subscriptions in self.subscriptions.values():

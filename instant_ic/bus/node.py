@@ -248,7 +248,7 @@ class Node(Generic[ConfigT]):
     def be_patient(self, patient: bool) -> None:
         """Let messages wait until a timer or :meth:`call_soon` wakes the node, at least once a second, or no longer.
 
-        For a node that nobody waits for: a wake-up costs several times what a further message costs in the same
+        For a node whose reaction is not urgent: a wake-up costs several times as much as a further message in the same
         wake-up. Messages get the time of the wake-up as their time of arrival.
         """
         self._transport.patient = patient
@@ -340,7 +340,7 @@ class Node(Generic[ConfigT]):
         try:
             try:
                 if self.node_report is not None:
-                    self.node_report.beat()  # so that nobody takes the node for dead
+                    self.node_report.beat()  # the launcher must not take the node for dead
             finally:
                 self.teardown()
         finally:

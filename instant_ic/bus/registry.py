@@ -199,7 +199,7 @@ class Claim:
             time.sleep(0.02)
 
     def _lock(self) -> bool:
-        """Try to lock the file that the path names now: the holder before may have removed the one just opened."""
+        """Try to lock the file at the path; False if the previous holder has removed the file just opened."""
         try:
             own_folder(self.stem.parent)
             self._fd = open_lock(self._lock_path, create=True)

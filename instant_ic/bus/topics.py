@@ -92,7 +92,7 @@ class Latest:
     def fresh(self) -> Any:
         """The newest message, or None when it was measured or commanded more than ``max_age_s`` ago.
 
-        For what a robot drives by: a message that waited while this node was busy counts as newly arrived.
+        For inputs that a robot drives by: to ``message``, one that has waited for this node is newly arrived.
         """
         return self._message if self.stamp_age_s <= self.max_age_s else None
 

@@ -1,4 +1,4 @@
-"""Lease of the right to drive: one sender at a time, and no start under a control that was held in vain."""
+"""Lease of the right to drive: one sender at a time, and no start under a control that was held before."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ class Lease:
     """Right to drive of one sender. Another one gets it after the holder has released it or was silent.
 
     A sender that takes over must let go of the controls first: send zero, or nothing for ``silent_s``. Else the robot
-    would start under a key that was held in vain until then. Times are nanoseconds of a clock that is never set.
+    would start under a key whose commands were refused until then. Times are nanoseconds of a clock that is never set.
 
     Args:
         silent_s: silence in seconds after which the holder counts as lost.

@@ -54,7 +54,7 @@ PANE = 10
 
 @njit(cache=True)
 def _take(key, odds, sums, last, sight, ix, iy, now, keep):  # type: ignore[no-untyped-def]
-    """Return the place of a cell's column; clear what another cell left there, or what is too old."""
+    """Return the place of a cell's column; clear it first if it holds another cell, or is too old."""
     n = key.shape[0]
     a, b = ix & (n - 1), iy & (n - 1)
     if key[a, b, 0] != ix or key[a, b, 1] != iy or now - last[a, b] > keep:

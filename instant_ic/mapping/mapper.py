@@ -137,7 +137,7 @@ class LocalMapper:
         if self._taken_ns is not None and (moved_m > TUNING.still_m or turned_rad > TUNING.still_rad):
             since_s = max(stamp_ns - self._taken_ns, 0) / 1e9
             advance_m = max(moved_m, min(since_s, self.config.every_s) * self.config.model.keep_m / TUNING.keep_s)
-        # At rest revolutions are few, and what has gone shall not stay for long.
+        # At rest revolutions are few: all beams free space, so that removed things vanish soon.
         stride = 1 if moved_m < self.config.every_m else STRIDE
         self.model.add(lidar, (model_from_map @ self._map_from(frame, middle_ns))[:3, 3], advance_m, stride)
         self._taken_ns, self._taken_at = stamp_ns, odom_from_lidar

@@ -52,7 +52,7 @@ FIXED = np.array([0.01, 0.01, 0.005])
 AGREED_M = 0.3
 """Motion of the tracks in agreement with the LiDAR that ends a contradiction."""
 _STANDS = 0.1
-"""Share of the one motion below which the other is none."""
+"""A motion below this share of the other counts as none."""
 _TO_M = np.array([1.0, 1.0, LEVER_M])
 
 

@@ -40,7 +40,7 @@ from instant_ic.slam.scan import FloatArray, Scan, ScanPoints, scan_points
 from instant_ic.slam.turn_factor import TurnFactor
 
 PROVISIONAL_KEYFRAMES = 8
-"""Number of keyframes after a sign of a loss that are provisional. Over a longer way a right pose drifts, too."""
+"""Number of provisional keyframes after a sign of a loss; over a longer way a right pose drifts as well."""
 
 
 @dataclass(frozen=True)

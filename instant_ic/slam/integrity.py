@@ -62,7 +62,7 @@ class IntegrityConfig:
         evidence: limit of a scan's log-likelihood ratio: no single scan decides.
         per_m: evidence of a metre in which all rays contradict the map before the sign and none the map since;
             0.3 m at a difference of 0.3 make a sign a loss.
-        agrees: difference of the two shares that is no evidence.
+        agrees: difference of the two shares up to which they agree.
         longest_step_m: way between two scans that counts at most, in metres.
         level_share: weight of a new scan in the usual score and contradiction.
         floor: least log-odds of being lost; higher makes false alarms, lower delays detection.
@@ -214,7 +214,7 @@ class IntegrityMonitor:
         self.contradiction = 0.0
         self.after_gap = self.sign = False
         self._log_odds = self._provisional_log_odds = TUNING.floor
-        self._suspicious = False  # the last scan, whatever the time since the one before
+        self._suspicious = False  # by the last scan alone, whatever the time since the one before
         self._unseen_s = 0.0
         self._moved_m = 0.0
         self._period_s: float | None = None

@@ -1,4 +1,4 @@
-"""Return of a session to a map that is not the one being made: a saved map, or that of the session before.
+"""Search for the robot in a map other than the one being made: a saved map, or that of the session before.
 
 While the robot is not located in that map, it maps in a frame of its own (a session). A search finds the session's
 recent scans in the map (``localization``); the place that was found is recognized if the scans do not contradict the
