@@ -34,7 +34,7 @@ class ConsoleNode(Node[ConsoleConfig], ConsoleBackend):
     def __init__(self, *wiring: Any, page: PageServer | None = None, **named: Any) -> None:
         super().__init__(*wiring, **named)
         self.page = page
-        """Receiver of images and state; the node's own server if None."""
+        """Receiver of images and state, but not of layers; the node's own server if None."""
 
     def setup(self) -> None:
         config = self.config
@@ -90,8 +90,11 @@ class ConsoleNode(Node[ConsoleConfig], ConsoleBackend):
         """Send everything as long as there is a page; without one, only keep what a new page gets at once."""
         self.feed.watched = watched
         self.be_patient(not watched)
-        if not watched:
-            self.feed_layers(False)
+        if self.layers is not None:  # without a page they would cost `nerf` CPU, too
+            self.drop(self.layers)
+            self.layers = None
+        if watched and self.page is None:
+            self.layers = self.subscribe("/vspace/layers", msg.VspaceLayers, self.mesher.submit, qos=LATCHED)
         for timer in self.page_timers:
             timer.cancel()
         rates = (
@@ -100,14 +103,6 @@ class ConsoleNode(Node[ConsoleConfig], ConsoleBackend):
             (1.0 / self.config.map_rate_hz, self.feed.send_grids),
         )
         self.page_timers = [self.timer(*rate) for rate in rates] if watched else []
-
-    def feed_layers(self, wanted: bool) -> None:
-        """Take the layers of the virtual space while a page can render them: they cost `nerf` CPU too."""
-        if wanted and self.layers is None:
-            self.layers = self.subscribe("/vspace/layers", msg.VspaceLayers, self.mesher.submit, qos=LATCHED)
-        elif not wanted and self.layers is not None:
-            self.drop(self.layers)
-            self.layers = None
 
     def reconfigure(self, config: ConsoleConfig) -> None:
         super().reconfigure(config)
@@ -142,9 +137,6 @@ class ConsoleNode(Node[ConsoleConfig], ConsoleBackend):
 
     def on_watched(self, watched: bool) -> None:
         self.call_soon(self.feed_page, watched)
-
-    def on_renders(self) -> None:
-        self.call_soon(self.feed_layers, True)
 
     def on_drawn(self) -> None:
         self.feed.report_shown()

@@ -42,9 +42,6 @@ class ConsoleBackend:
     def on_watched(self, watched: bool) -> None:
         """Note that the first page has come (True) or the last one has gone (False)."""
 
-    def on_renders(self) -> None:
-        """Note that a page can render the virtual space by itself; called once for each page."""
-
     def on_drawn(self) -> None:
         """Note that ``ConsoleServer.drawn_ms`` has changed."""
 

@@ -378,9 +378,6 @@ class Pages:
     def _on_drawn(self, session: PageSession, message: dict[str, Any], now: float) -> None:
         version, state_ms = whole(message, "version"), number(message, "state_ms", 0.0, now_ms())
         before = self.drawn_ms()
-        if not session.renders:
-            session.renders = True
-            self._backend.on_renders()
         if version == 0:
             session.drawn = None
         else:

@@ -42,7 +42,8 @@ class RecordingDesk:
 
     def record(self, on: bool) -> None:
         """Start or stop a recording."""
-        self._submit(self._begin if on else self._end)
+        command, text = ("record", "Recording to") if on else ("stop", "Recording saved:")
+        self._submit(lambda: f"{text} {_name(self._ask(command)['path'])}")
 
     def snapshot(self) -> None:
         """Save the last minute."""
@@ -76,12 +77,6 @@ class RecordingDesk:
         except RecorderError as error:
             logger.warning("%s", error)
             return {"text": str(error), "level": "error"}
-
-    def _begin(self) -> str:
-        return f"Recording to {_name(self._ask('record')['path'])}"
-
-    def _end(self) -> str:
-        return f"Recording saved: {_name(self._ask('stop')['path'])}"
 
     def status(self) -> dict[str, Any]:
         """Ask the recorder for its state and return the page's ``recording`` message."""

@@ -35,7 +35,6 @@ class PageSession:
         closing: closing handshake, once the session has ended.
         chokes: true if too many replies are pending, which means that the client does not read.
         away: true if the page is hidden or its operator types.
-        renders: true if the page can render the virtual space by itself, once it has layers.
         drawn: version of the layers that the page renders by itself, and time of the newest state that it has shown
             (server's clock, ms); None: it needs rendered views.
     """
@@ -49,7 +48,6 @@ class PageSession:
     closing: asyncio.Task[None] | None = None
     chokes: bool = False
     away: bool = False
-    renders: bool = False
     drawn: tuple[int, float] | None = None
     _held: frozenset[str] = frozenset()  # digests of the layers that the page holds
     _offered: frozenset[str] = frozenset()  # of the layers sent last

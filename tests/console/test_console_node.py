@@ -334,18 +334,12 @@ def test_views_that_are_only_judged_are_small_and_go_to_no_page(setup):
     assert bus.last("/view/shown").view_id != bus.last("/view/request").id
 
 
-def test_layers_are_taken_while_a_page_can_render_them(setup):
-    _, node, _ = setup
-
-    def taken():
-        return "/vspace/layers" in [subscription.raw.topic for subscription in node.subscriptions]
-
-    assert not taken()
-    node.on_renders()
-    node.spin_once()
-    assert taken()
-    node.feed_page(False)
-    assert not taken()
+def test_layers_are_taken_while_there_is_a_page():
+    with LockstepBus(START) as bus:
+        node = bus.add(ConsoleNode, ConsoleConfig())
+        for watched in (False, True, False):
+            node.feed_page(watched)
+            assert ("/vspace/layers" in [one.raw.topic for one in node.subscriptions]) is watched
 
 
 def test_layers_that_no_page_could_render_are_a_fault_of_the_console(setup):
