@@ -22,7 +22,7 @@ const lease = new Lease(link);
 const drive = new Drive(link);
 /** @type {State | null} The newest state message. */
 let state = null;
-// First what works without an image too: emergency stop and banner.
+// Emergency stop and banner come first, because they work without an image too.
 attachStop();
 for (const name of ["open", "lost"]) link.addEventListener(name, showBanner);
 lease.addEventListener("change", showBanner);
@@ -47,7 +47,7 @@ function makeViewer() {
   }
 }
 
-/** Shows what to do to see the robot, and the emergency stop: a page that shows nothing must not drive. */
+/** Leaves only advice and the emergency stop on the page: a page that shows nothing must not drive. */
 function onlyStop() {
   const text = byId("no-view");
   byId("stick").remove();
@@ -62,7 +62,7 @@ function showBanner() {
 
 // ---- from the server -----------------------------------------------------------------------------
 
-link.addEventListener("lost", () => drive.setEnabled(false)); // the page keeps the lease: the banner says what has happened
+link.addEventListener("lost", () => drive.setEnabled(false)); // the banner says what happened
 lease.addEventListener("change", () => {
   drive.setEnabled(lease.drives);
   hud.showLease(lease);
@@ -121,7 +121,7 @@ async function takeGrid(grid) {
 
 // ---- from the operator -----------------------------------------------------------------------------
 
-/** The button and the space bar stop the robot. */
+/** Makes the button and the space bar stop the robot. */
 function attachStop() {
   for (const name of ["pointerdown", "click"]) byId("estop").addEventListener(name, stopNow);
   for (const name of /** @type {const} */ (["keydown", "keyup"])) {
@@ -138,7 +138,7 @@ function attachStop() {
 function stopNow() {
   drive.stop();
   link.send({ type: "estop" });
-  // Also by a separate connection: the WebSocket may be stuck, and a second stop changes nothing.
+  // A second request takes its own connection, because the WebSocket may be stuck. A second stop changes nothing.
   fetch("/estop", { method: "POST", keepalive: true }).then(({ ok }) => ok).catch(() => false).then((sent) => {
     if (!sent && !link.connected) hud.toast("Emergency stop not sent: no connection to the server.");
   });
@@ -149,7 +149,7 @@ function askForTheLease() {
   if (refusal) hud.toast(refusal);
 }
 
-/** @param {number} percent of the speed limit */
+/** Sets the speed limit. @param {number} percent of the largest one, 10 to 100 */
 function setScale(percent) {
   const value = Math.min(Math.max(percent, 10), 100);
   scale.value = String(value);
@@ -172,10 +172,10 @@ function glide() {
   hud.toast(`Smooth motion of the camera's image: ${images.glides ? "on" : "off"}`);
 }
 
-/** @param {number} percent */
+/** Changes the speed limit. @param {number} percent to add */
 const changeScale = (percent) => setScale(+scale.value + percent);
 const slower = () => changeScale(-10), faster = () => changeScale(10);
-/** @type {Record<string, () => void>} By key; buttons name one in data-key. */
+/** @type {Record<string, () => void>} Actions by key code. A button names its key in data-key. */
 const SHORTCUTS = {
   KeyC: () => look.centre(),
   KeyM: () => screen.enlargeMap(),

@@ -1,5 +1,5 @@
 // @ts-check
-// Colour matching of two images of one place: a gain for each channel, by which a camera's exposures and white balances differ.
+// Colour matching of two images of one place by a gain for each channel: exposure and white balance change only gains.
 
 /** @import { Vec3 } from "./math.js" */
 import { clamp } from "./math.js";
@@ -12,8 +12,8 @@ const DARKEST = 0.05, BRIGHTEST = 0.95; // the ratio of darker values is noise, 
 const MOST_GAIN = 1.8;
 
 /**
- * Returns the gains that make `from` look most like `to`: the median ratio, so that samples that differ by more than colour
- * (something moved, an edge is slightly off) do not count.
+ * Returns the gains that make `from` look most like `to`. The median ratio ignores samples where something moved or an edge
+ * is slightly off.
  * @param {number[]} from 3 values per sample, 0..1 @param {number[]} to @param {number[]} weights one per sample, 0..1
  * @returns {Vec3}
  */

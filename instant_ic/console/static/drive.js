@@ -153,7 +153,7 @@ export function attachStick(element, drive) {
     drive.setStick(deadZone(-y / radius), deadZone(-x / radius));
   };
   element.addEventListener("pointerdown", (event) => {
-    if (pointer !== null || !drive.enabled) return; // a touch that began in vain never drives
+    if (pointer !== null || !drive.enabled) return; // a touch that began without the lease never drives
     pointer = event.pointerId;
     element.setPointerCapture(event.pointerId);
     event.preventDefault();

@@ -21,7 +21,7 @@ const STEP = 10; // percent of the speed limit
  * @property {() => void} wake the direction changed
  */
 
-/** It drives only if the window has focus and the button was pressed after it gained focus. */
+/** The gamepad drives only while the window has focus, with a shoulder button pressed after it gained focus. */
 export class Gamepads {
   /** @param {Drive} drive @param {Look} look @param {PadActions} actions */
   constructor(drive, look, actions) {

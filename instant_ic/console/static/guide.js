@@ -6,7 +6,7 @@ import { attribute, byId } from "./dom.js";
 import { degrees, rotate, wrapAngle } from "./math.js";
 
 const NEAREST_M = 0.25;
-const REACH_M = 4; // the nearby floor is out of view, so the arc is extended to here
+const REACH_M = 4; // the trajectory is extended to here, because the nearby floor is out of view
 const STEP_M = 0.1;
 const COMPASS_PIXELS = 1.6; // per degree, as in style.css
 
@@ -36,8 +36,8 @@ export function extended(points) {
 }
 
 /**
- * Shows `trajectory` (map frame, [[x, y], ...]) as a ribbon on the floor as seen by the shown camera.
- * @param {[number, number][]} trajectory @param {{lookFromMap: Mat3, position: Vec3}} camera
+ * Shows the predicted trajectory as a ribbon on the floor, seen by the shown camera.
+ * @param {[number, number][]} trajectory points in the map frame, m @param {{lookFromMap: Mat3, position: Vec3}} camera
  * @param {[number, number]} tanHalf of the shown field of view @param {number} halfWidth m
  */
 export function showGuide(trajectory, camera, tanHalf, halfWidth) {

@@ -69,7 +69,7 @@ export function showHealth({ vspace, battery, faults, nodes, pace }) {
 }
 
 /**
- * Fills a list, unless its entries are the same as before.
+ * Fills a list if its entries have changed.
  * @template T
  * @param {HTMLElement} element @param {T[]} entries @param {(entry: T) => HTMLElement} item
  */

@@ -35,9 +35,9 @@ const KEPT_TIMES = 100; // of images, for their rate
 // Longest wait for an image made after the change of mode; afterwards the best available is shown.
 const WAIT_MS = { [PANORAMA]: 300, [VIEW]: 500 };
 const LAYERS_MS = 5000; // longest wait for the layers of a new link
-const ELSEWHERE_M = 0.5; // a camera image taken farther away is shown as it was taken
-const FROZEN_MS = 1000; // an older one too
-const LEAD_MS = 800; // time after a switch in which the way of a command to the robot comes to be predicted
+// A camera image taken farther away, or older, is shown as it was taken.
+const ELSEWHERE_M = 0.5, FROZEN_MS = 1000;
+const LEAD_MS = 800; // after a switch, the prediction takes this long to include the full delay of a command
 
 export class Images {
   /** @param {GlViewer} viewer @param {Link} link */
@@ -57,11 +57,9 @@ export class Images {
     this.layers = null;
     /** @type {Map<string, Surface>} Loaded surfaces, by id. */
     this._held = new Map();
-    this._loads = 0; // counts loads, so that a late one of a lost link is dropped
-    /** @type {number | null} Time from the capture of a camera image to the end of its first rendering. */
+    this._loads = 0; // number of links so far; layers of an earlier link are dropped
+    /** @type {number | null} Time from the capture of the newest camera image to its first rendering. */
     this.cameraMs = null;
-    /** @type {PanoramaHeader | null} The camera image of the frame that is being rendered. */
-    this._rendering = null;
     /** @type {PanoramaHeader | null} The camera image of the last rendered frame. */
     this._rendered = null;
     this.shownMs = 0; // time of the newest state that is shown, server's clock
@@ -73,9 +71,9 @@ export class Images {
     this._now = null;
     /** @type {[number, number] | null} Position of the real robot's camera in the last scene, if it was shown. */
     this._followed = null;
-    this._lead = 0; // share of the time that a command takes to the robot which is predicted
+    this._lead = 0; // share of a command's delay that is predicted
     this._virtual = false;
-    // Time since which images of each kind are made at the shown robot, server's clock; Infinity: they are not.
+    // Time from which on images of each kind are taken at the shown robot, server's clock; Infinity: they are not.
     this._since = { [PANORAMA]: Infinity, [VIEW]: Infinity };
     this._changedAt = 0;
     this._toward = 0;
@@ -132,7 +130,7 @@ export class Images {
     if (load === this._loads) this.link.acknowledge(frame, loaded);
   }
 
-  /** A link is new: a server with layers sends them again. Without them, the page returns to rendered views. */
+  /** Waits for the layers of a new link. If none come, the page returns to rendered views. */
   expectLayers() {
     const load = ++this._loads, { layers } = this;
     setTimeout(() => {
@@ -155,7 +153,7 @@ export class Images {
     return this.layers !== null && !this.viewer.lost;
   }
 
-  /** Counts an image that came, or a view that this page has rendered by itself. @param {Kind} kind */
+  /** Counts a received image, or a view that this page rendered by itself. @param {Kind} kind */
   countFrame(kind) {
     this._times[kind] = [...this._times[kind].slice(1 - KEPT_TIMES), performance.now()];
   }
@@ -166,18 +164,12 @@ export class Images {
     return recent.length < 2 ? 0 : (1000 * (recent.length - 1)) / (now - recent[0]);
   }
 
-  /** Notes that a frame with the newest images is being rendered. */
-  startFrame() {
-    this._rendering = this.blend < 1 ? this.panorama : null;
-  }
-
-  /** Notes that the last frame is rendered. */
-  endFrame() {
-    const { _rendering: image } = this, now = this.link.serverNow();
-    this._rendering = null;
-    if (!image || image === this._rendered || now === null) return;
-    this._rendered = image;
-    this.cameraMs = now - image.captured_ms;
+  /** Notes that a frame with the newest images was rendered. */
+  noteRendered() {
+    const { panorama } = this, now = this.link.serverNow();
+    if (!panorama || panorama === this._rendered || this.blend === 1 || now === null) return;
+    this._rendered = panorama;
+    this.cameraMs = now - panorama.captured_ms;
   }
 
   /** Header of the shown image. */
@@ -237,8 +229,8 @@ export class Images {
   }
 
   /**
-   * Returns the place from which the camera's image is shown: the robot's present place, by the depth of the layers, so that
-   * a low frame rate looks smooth. Null: the image is shown as it was taken. An old image must not look like a new one.
+   * Returns the robot's present place, from which the camera's image is shown by the depth of the layers, so that a low frame
+   * rate looks smooth. Null: the image is shown as it was taken, so that an old one does not look new.
    * @param {State | null} state @returns {Glide | null}
    */
   _glided(state) {
@@ -251,8 +243,8 @@ export class Images {
   }
 
   /**
-   * Returns the v-bot's camera; null if its pose is unknown. A gliding camera image and the layers are shown from one place.
-   * When the real robot is shown again, the place moves on with that robot, so that both images of the dissolve move alike.
+   * Returns the camera of the layers; null if its pose is unknown. A gliding camera image and the layers share one place.
+   * When the real robot is shown again, the place moves on with it, so that both images of the dissolve move alike.
    * @param {LayersHeader} layers @param {Mat3} mapFromLook @param {[number, number]} tanHalf @param {Glide | null} glide
    * @returns {Camera | null}
    */
@@ -271,7 +263,7 @@ export class Images {
   }
 
   /**
-   * Advances the dissolve; returns true when one starts from an image that was shown alone.
+   * Advances the dissolve. Returns true when a dissolve starts while one image is shown alone.
    * @param {State | null} state @param {number} elapsedMs
    */
   _step(state, elapsedMs) {
@@ -283,7 +275,7 @@ export class Images {
     const nearVbot = virtual || state?.mode === "entering", nearRobot = !virtual || state?.mode === "returning";
     this._since[VIEW] = nearVbot ? Math.min(this._since[VIEW], at) : Infinity;
     this._since[PANORAMA] = nearRobot ? Math.min(this._since[PANORAMA], at) : Infinity;
-    // A stop shows the real view, however old; so does a lost controller.
+    // A stop or a lost controller shows the camera's image, however old.
     const waits = virtual || state?.mode === "real";
     const kind = virtual ? VIEW : PANORAMA, wanted = virtual ? 1 : 0;
     const toward = this.blend === wanted || this._toward === wanted || !waits || this._fits(kind) ? wanted : 1 - wanted;
@@ -305,7 +297,7 @@ export class Images {
     return header.captured_ms >= this._since[kind] || (this.link.serverNow() ?? 0) - this._changedAt > WAIT_MS[kind];
   }
 
-  /** Matches the colours of the new image to the old one; both show the same place. @param {Scene} scene @param {number} now */
+  /** Matches the colours of the new image to those of the old one. @param {Scene} scene @param {number} now */
   _match(scene, now) {
     if (this._gains[VIEW].releaseMs <= 0) return;
     const seen = this.viewer.sample(scene);
@@ -331,7 +323,7 @@ export class Images {
   }
 }
 
-/** Which robot the operator sees and drives. @param {State | null} state @returns {"real" | "virtual"} */
+/** Returns the robot that the operator sees and drives. @param {State | null} state @returns {"real" | "virtual"} */
 export const shows = (state) => (state?.shown === "virtual" ? "virtual" : "real");
 
 /** @param {number} share @param {boolean} up @param {number} step @returns {number} */

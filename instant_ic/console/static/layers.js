@@ -1,6 +1,6 @@
 // @ts-check
-// Renderer in WebGL 2: layers of triangles around a keyframe, from any place (Python: vspace/layers.py), with their own
-// colours or with the camera's image; and the camera's image as it was taken, without depth.
+// Renderer in WebGL 2. It renders layers, which are triangles around a keyframe (Python: vspace/layers.py), from any place,
+// with their own colours or with the camera's image. It also renders the camera's image as it was taken, without depth.
 
 /** @import { Mat3, Vec3 } from "./math.js" */
 /** @import { Mesh } from "./messages.js" */
@@ -34,7 +34,7 @@ import { createTexture, Program, setImage } from "./program.js";
 
 const NEAR_M = 0.02;
 const WHITE = [255, 255, 255];
-const BEYOND_LEVEL = 4; // mipmap level of what no layer covers
+const BEYOND_LEVEL = 4; // mipmap level where no layer has a surface
 
 // Homogeneous coordinates are divided by the vertex's distance, so that infinitely far vertices need no large numbers.
 const VERTEX = `
@@ -57,7 +57,7 @@ const ANGLES = `
 const vec3 GREY = vec3(0.30, 0.59, 0.11);
 const float PI = ${Math.PI};
 
-// Azimuth and angle from the zenith. The CPU's own functions take a seventh of its time for an image; polynomials
+// Azimuth and angle from the zenith. On the CPU, atan and acos take a seventh of an image's time; the polynomials
 // (Abramowitz and Stegun, 4.4.45 and 4.4.49) are exact to 7e-5 rad, a fiftieth of a pixel.
 vec2 angles(vec3 d) {
   if (SHARP) return vec2(atan(d.y, d.x), acos(clamp(d.z, -1.0, 1.0)));
@@ -123,7 +123,7 @@ export class LayerRenderer {
     this._anisotropy = slow ? null : gl.getExtension("EXT_texture_filter_anisotropic");
     /** @type {(Loaded & {layer: Layer})[]} Each is shown where the ones before show nothing. */
     this._layers = [];
-    this._seen = createTexture(gl, WHITE); // confidence of a surface all of which was seen
+    this._seen = createTexture(gl, WHITE); // confidence of a surface that was seen completely
   }
 
   /** Replaces the layers; loaded surfaces stay. @param {Layer[]} layers */
@@ -140,7 +140,7 @@ export class LayerRenderer {
   }
 
   /**
-   * The alpha of what is rendered is 1 where the place was seen.
+   * Renders the layers; alpha is 1 where the place was seen.
    * @param {Camera} camera @param {number} width @param {number} height
    * @param {Vec3} tint gains of the colours
    * @param {Photo | null} photo takes the place of the layers' own colours; only the depth of estimated surfaces counts then

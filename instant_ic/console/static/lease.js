@@ -17,7 +17,7 @@ export class Lease extends EventTarget {
     this.mayDrive = true; // false: signed in to watch
     /** @type {Session["driver"]} */
     this.driver = "none";
-    this.door = ""; // through which another operator drives, if not by a page of this server
+    this.door = ""; // connection of an operator who drives without a page of this server
     this.clients = 0;
     this.estop = false;
     this._handedOver = false; // the operator gave the lease back
@@ -50,7 +50,7 @@ export class Lease extends EventTarget {
     return this.driver === "other" ? this.refusal : "";
   }
 
-  /** Why this page does not drive while another operator does, and what to do. */
+  /** Text for an operator who cannot drive because another one does, with what to do. */
   get refusal() {
     return this.door ? ELSEWHERE : OTHER_DRIVES;
   }

@@ -32,7 +32,7 @@ export class Link extends EventTarget {
     this._sequence = 0;
     this._connect();
     setInterval(() => this._beat(), PING_MS);
-    // At once, because timers of hidden pages run once a second or not at all.
+    // Sent at once, because timers of hidden pages run once a second or not at all.
     document.addEventListener("visibilitychange", () => this._ping());
     window.addEventListener("pagehide", () => this._ping(true));
   }
@@ -88,7 +88,7 @@ export class Link extends EventTarget {
     this._retryMs = Math.min(this._retryMs * 2, LAST_RETRY_MS);
   }
 
-  /** Asks by an ordinary request why the WebSocket was refused; a WebSocket gives a page no reason. */
+  /** Asks why the WebSocket was refused by an ordinary request, because a WebSocket gives no reason. */
   async _askWhy() {
     try {
       const answer = await fetch("/health", { cache: "no-store" });
@@ -138,7 +138,7 @@ export class Link extends EventTarget {
       if (!(error instanceof MessageError)) throw error;
       console.error(`message of the server dropped: ${error.message}`);
       const frame = typeof data === "string" ? null : frameNumber(data);
-      if (frame) this.acknowledge(frame, false); // else the server would wait, and send no other one
+      if (frame) this.acknowledge(frame, false); // the server waits for this before it sends the next one
     }
   }
 

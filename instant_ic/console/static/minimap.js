@@ -1,5 +1,5 @@
 // @ts-check
-// Map in the corner: walls, costs, both robots, path, subgoal and predicted trajectory. SVG in metres over two grids.
+// Map in the corner: two grids, and over them an SVG in metres with both robots, path, subgoal and predicted trajectory.
 
 /** @import { GridHeader, Plan } from "./messages.js" */
 /** @import { Vec3 } from "./math.js" */
@@ -74,7 +74,7 @@ export class MiniMap {
 }
 
 /**
- * Returns the transform that turns by `angle`, scales, and shows the place of the map at a pixel; y points up in the map.
+ * Returns a transform from the map, whose y axis points up, to pixels: turned, scaled, with one place shown at one pixel.
  * @param {number} scale @param {number} angle @param {[number, number]} place @param {[number, number]} pixel
  */
 function matrix(scale, angle, [x, y], [column, row]) {
@@ -98,8 +98,7 @@ function colour(canvas, bitmap, colourOf) {
   context.putImageData(cells, 0, 0);
 }
 
-// A cell is 0..100, or 255: unknown.
-/** Floor and walls. @param {number} cell */
+/** Returns the colour of floor and walls. @param {number} cell 0 to 100; 255: unknown */
 const mapColour = (cell) => (cell < 50 ? [150, 165, 180, 70 - cell] : cell <= 100 ? [226, 232, 238, 120 + 1.3 * cell] : [0, 0, 0, 0]);
-/** @param {number} cell */
+/** @param {number} cell the same */
 const costColour = (cell) => (cell <= 100 ? [255, 110, 80, 0.6 * cell] : [0, 0, 0, 0]);

@@ -6,8 +6,8 @@ import { clamp, wrapAngle } from "./math.js";
 
 const EXTRAPOLATION_MS = 200;
 export const SMOOTHING_MS = 50;
-const SNAP_RAD = 0.6, SNAP_M = 0.5; // a larger jump is a new pose, not a motion
-const EASED_RAD = 0.2, EASED_M = 0.3; // the same between the two robots
+const SNAP_RAD = 0.6, SNAP_M = 0.5; // a larger jump is shown at once
+const EASED_RAD = 0.2, EASED_M = 0.3; // a larger offset between the two robots is not eased out
 
 export class Motion {
   constructor() {
@@ -27,10 +27,9 @@ export class Motion {
   }
 
   /**
-   * Advances by `elapsedMs`. `robot`: name of the shown robot; when it changes, the difference between the two poses is
-   * eased out. `pose` and `twist` [m/s, rad/s] are `ageMs` old.
-   * @param {string} robot @param {Vec3 | null | undefined} pose @param {[number, number]} twist
-   * @param {number} ageMs @param {number} elapsedMs
+   * Advances by `elapsedMs`. When the shown robot changes, the difference between the two poses is eased out.
+   * @param {string} robot name of the shown robot @param {Vec3 | null | undefined} pose @param {[number, number]} twist m/s, rad/s
+   * @param {number} ageMs of pose and twist @param {number} elapsedMs
    */
   follow(robot, pose, twist, ageMs, elapsedMs) {
     if (!pose) return;

@@ -9,7 +9,7 @@ import { advanced } from "./motion.js";
 const MOST_MS = 250; // longest time that is predicted
 const MOST_DELAY_MS = 100; // longest delay of a command that is predicted
 const STEP_MS = 10;
-const SETTLED_MS = 700; // from this age of a command on, the speed of the state counts
+const SETTLED_MS = 700; // after this age of a command, the robot keeps the speed of the state
 
 export class Prediction {
   constructor() {
@@ -32,9 +32,9 @@ export class Prediction {
   }
 
   /**
-   * Returns pose and twist at `now`, from those of a state of the time `at`; times of the server's clock, ms.
+   * Returns pose and twist at `now`, predicted from those of a state at the time `at`; server's clock, ms.
    * @param {Vec3} pose @param {Twist} twist @param {number} at @param {number} now
-   * @param {number} delayMs time that a command takes to the robot: commands sent less than this before the state are not in it
+   * @param {number} delayMs delay of a command: the state does not include commands sent less than this before it
    * @returns {{pose: Vec3, twist: Twist}}
    */
   from(pose, twist, at, now, delayMs) {

@@ -1,5 +1,5 @@
 // @ts-check
-// Buttons for recording, for a snapshot of the last minute and for a bookmark: commands to the server, and their results.
+// Recording, snapshot of the last minute and bookmark: buttons, commands to the server, and their results.
 
 /** @import { Link } from "./link.js" */
 /** @import { RecordingStatus } from "./messages.js" */

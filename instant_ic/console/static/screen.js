@@ -23,7 +23,7 @@ const MAX_FOV = radians(149);
 const LATENCY_MS = 250;
 const SLOW_FRAME_MS = 45; // shortest frame time when the CPU renders, with fewer pixels
 const SLOW_PIXELS = 0.45; // share of the window's pixels per axis
-const STILL_PIXELS = 0.5, LEAST_PIXELS = 0.3; // smallest shown turn while the robot stands, and while the v-bot is driven
+const STILL_PIXELS = 0.5, LEAST_PIXELS = 0.3; // smallest turn that is rendered while the robot stands, and while the v-bot drives
 
 export class Screen {
   /** @param {GlViewer} viewer @param {Images} images @param {Look} look @param {Link} link @param {Lease} lease */
@@ -60,7 +60,7 @@ export class Screen {
     this.wake();
   }
 
-  /** Reports that the newest state is on the screen if this page renders the virtual space by itself; else, that it needs views. */
+  /** Reports that the newest state is on the screen, or that this page needs rendered views. */
   _reportShown() {
     const { state, images, link } = this;
     if (!state) return;
@@ -92,7 +92,6 @@ export class Screen {
   /** @param {number} now ms of this page's clock */
   _frame(now) {
     if (this.viewer.busy) return this._request();
-    this.images.endFrame();
     if (!this._wanted) return;
     const pause = this.viewer.slow ? SLOW_FRAME_MS / (this.images.changed ? 2 : 1) : 0;
     const left = Math.max(this._viewAt + pause, this.viewer.restUntil) - now;
@@ -101,9 +100,7 @@ export class Screen {
       return;
     }
     this._wanted = this._renderFrame(now);
-    if (this.viewer.busy) return this._request();
-    this.images.endFrame();
-    if (this._wanted) this._request();
+    if (this._wanted || this.viewer.busy) this._request();
   }
 
   /** Sends the look direction, and renders what has changed; returns whether something moves. @param {number} now */
@@ -170,7 +167,7 @@ export class Screen {
     const resized = fit(viewer.canvas, viewer.slow ? SLOW_PIXELS : 1);
     const key = rounded([scene.blend], 4) + rounded(scene.blend > 0 ? scene.camera?.position : scene.glide?.to, 3);
     const direction = [...scene.mapFromLook, look.vfov];
-    // A standing robot's pose is never still: SLAM turns it by parts of a milliradian with every scan. The v-bot's is.
+    // SLAM turns a standing robot by a fraction of a milliradian with every scan; the v-bot's pose has no such noise.
     const least = (images.moves ? LEAST_PIXELS : STILL_PIXELS) * 2 * this._tanHalf()[0] / viewer.canvas.width;
     const turned = this._direction.some((value, index) => Math.abs(value - direction[index]) > least);
     const moves = turned || key !== this._viewKey;
@@ -178,9 +175,9 @@ export class Screen {
     this._viewKey = key;
     this._direction = direction;
     images.changed = false;
-    this._viewAt = this._steppedAt; // only such a frame costs a pause: in the first after a key nothing has moved yet
-    images.startFrame();
+    this._viewAt = this._steppedAt; // a frame that renders nothing needs no pause
     viewer.render(scene);
+    images.noteRendered();
     if (scene.camera && scene.blend > 0) images.countFrame(VIEW);
     // For measurements: the rendered image and its position.
     const { motion, view, panorama, place } = images;

@@ -62,7 +62,7 @@ export function vspaceText(vspace) {
 }
 
 /**
- * Quality of the virtual space: PSNR of the training or of the requested view, share of it that was seen, valid range.
+ * Returns the quality of the virtual space: PSNR of the training or of the requested view, share seen, valid range.
  * @param {Vspace | null} vspace
  */
 export function vspaceQuality(vspace) {
@@ -75,7 +75,7 @@ export function vspaceQuality(vspace) {
 }
 
 /**
- * The banner, by priority: lost link, emergency stop, key held through a stop; null: none.
+ * Returns the banner, by priority: lost link, emergency stop, key held through a stop; null: none.
  * `held`: the robot is stopped and the operator still holds a control.
  * @param {{lost: boolean, estop: boolean, held: boolean, driver: Session["driver"], reason: string}} situation
  */

@@ -29,7 +29,7 @@ void main() {
 
 /** Width and height of the samples, pixels. */
 const SAMPLE = /** @type {const} */ ([64, 40]);
-// Pause between two frames that the CPU renders, as a share of the time that it takes for one, and the longest.
+// Pause after a frame that the CPU rendered, as a share of its duration, and the longest pause.
 const REST = 0.3, MOST_REST_MS = 100;
 
 /** @typedef {{1: number[], 2: number[], weights: number[]}} Samples Colours by kind of image: 3 values per pixel, 0..1. */
@@ -59,9 +59,9 @@ export class GlViewer {
     /** @type {WebGLSync | null} Signalled when the CPU has rendered the last frame. */
     this._fence = null;
     this._renderedAt = 0;
-    /** The next frame pauses, so that messages and new views are not delayed. */
+    /** Earliest time of the next frame, which leaves time for messages and new views. */
     this.restUntil = 0;
-    // A program is translated at its first use; that must not delay the first frame after a switch.
+    // The driver translates a program at its first use, which must not delay the first frame after a switch.
     gl.viewport(0, 0, 1, 1);
     this._renderer.renderFar(this._panorama, identity, [1, 1]);
     this._renderView({ viewFromLook: identity, tanHalf: [1, 1], viewTanHalf: [1, 1] }, plain);
@@ -92,7 +92,6 @@ export class GlViewer {
     const gl = this.gl, { width, height } = this.canvas;
     if (scene.blend > 0) this._renderVirtual(scene, width, height, scene.viewGain);
     if (scene.blend < 1) {
-      // Over the virtual space.
       if (scene.blend > 0) gl.enable(gl.BLEND);
       gl.blendColor(0, 0, 0, 1 - scene.blend);
       gl.blendFunc(gl.CONSTANT_ALPHA, gl.ONE_MINUS_CONSTANT_ALPHA);
@@ -119,8 +118,8 @@ export class GlViewer {
   }
 
   /**
-   * Returns panorama and view without colour matching, small and in the same projection; `weights` are 0 where the view
-   * shows no seen place.
+   * Returns panorama and view, small, in one projection and without colour matching; `weights` are 0 where the view shows
+   * estimated surfaces.
    * @param {Scene} scene @returns {Samples}
    */
   sample(scene) {
