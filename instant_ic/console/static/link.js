@@ -3,7 +3,7 @@
 
 /** @import { Frame, PartFrame, Pong } from "./messages.js" */
 import { ServerClock } from "./clock.js";
-import { decodeFrame, frameNumber, MessageError, PART, parseMessage, Parts } from "./messages.js";
+import { decodeFrame, frameNumber, MessageError, PART, parseMessage } from "./messages.js";
 
 const PING_MS = 50; // the server counts a driver as lost after beat_timeout_s (0.25 s)
 const SILENCE_MS = 1000; // the link counts as lost after this silence
@@ -28,7 +28,7 @@ export class Link extends EventTarget {
     this._socket = null;
     this._retryMs = FIRST_RETRY_MS;
     this._heard = 0;
-    this._parts = new Parts();
+    this._pieces = new Blob(); // of a frame that comes in pieces
     this._sequence = 0;
     this._connect();
     setInterval(() => this._beat(), PING_MS);
@@ -142,12 +142,17 @@ export class Link extends EventTarget {
     }
   }
 
-  /** @param {PartFrame} part */
+  /** Takes a piece of a frame; the frame is complete once the pieces have its size. @param {PartFrame} part */
   _collect(part) {
+    const { header: { start, size }, payload } = part, socket = this._socket;
     this.acknowledge(part);
-    const socket = this._socket;
-    this._parts.take(part)?.arrayBuffer().then((whole) => {
-      if (socket === this._socket) this._receive(whole);
+    if (start === 0) this._pieces = new Blob();
+    if (start !== this._pieces.size) throw new MessageError(`part.start must be ${this._pieces.size} (got ${start})`);
+    const whole = this._pieces = new Blob([this._pieces, payload]);
+    if (whole.size !== size) return;
+    this._pieces = new Blob();
+    whole.arrayBuffer().then((bytes) => {
+      if (socket === this._socket) this._receive(bytes);
     });
   }
 

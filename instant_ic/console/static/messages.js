@@ -167,7 +167,6 @@ function parsed(json) {
 // ---- binary frames -------------------------------------------------------------------------------
 
 export const PANORAMA = 1, VIEW = 2, MAP = 3, COSTMAP = 4, LAYERS = 5, PART = 6;
-const KINDS = /** @type {const} */ ([PANORAMA, VIEW, MAP, COSTMAP, LAYERS, PART]);
 const PREFIX_BYTES = 12;
 const VERSION = 1;
 
@@ -215,35 +214,6 @@ const layersHeader = object({
 /** @typedef {FrameOf<1> | FrameOf<2> | GridFrame | LayersFrame} Frame */
 /** @typedef {FrameOf<6>} PartFrame */
 
-/** Assembler of a frame that comes in pieces, in order. */
-export class Parts {
-  constructor() {
-    /** @type {Blob[]} */
-    this._pieces = [];
-    this._size = 0;
-  }
-
-  /**
-   * Takes a piece; returns the bytes of the frame once it is complete, else null. Throws MessageError.
-   * @param {PartFrame} part
-   */
-  take({ header: { start, size }, payload }) {
-    if (start === 0) this._clear();
-    if (start !== this._size) return refuse("part.start", String(this._size), start);
-    this._pieces.push(payload);
-    this._size += payload.size;
-    if (this._size !== size) return null;
-    const whole = new Blob(this._pieces);
-    this._clear();
-    return whole;
-  }
-
-  _clear() {
-    this._pieces = [];
-    this._size = 0;
-  }
-}
-
 /** Decodes a binary frame; throws MessageError. @param {ArrayBuffer} buffer @returns {Frame | PartFrame} */
 export function decodeFrame(buffer) {
   const view = new DataView(buffer), size = buffer.byteLength;
@@ -264,8 +234,8 @@ export function decodeFrame(buffer) {
  */
 export function frameNumber(buffer) {
   if (buffer.byteLength < PREFIX_BYTES) return null;
-  const view = new DataView(buffer), kind = KINDS.find((known) => known === view.getUint8(1));
-  return kind === undefined ? null : { kind, sequence: view.getUint32(4, true) };
+  const view = new DataView(buffer), kind = /** @type {Frame["kind"]} */ (view.getUint8(1));
+  return kind === LAYERS || Object.hasOwn(HEADERS, kind) ? { kind, sequence: view.getUint32(4, true) } : null;
 }
 
 /** @param {unknown} value @param {ArrayBuffer} payload @returns {Pick<LayersFrame, "header" | "layers">} */

@@ -9,30 +9,25 @@ import { bytesText, recorderText, recordText } from "./texts.js";
 
 const RUNNING = ["recording", "disk full"];
 
-/** @type {RecordingStatus} */
-const NO_ANSWER = {
-  type: "recording", recorder: "missing", state: "none", text: "The recorder has not answered yet.",
-  notice: { number: 0, text: "", level: "ok" }, path: null, seconds: null, bytes: null, free_bytes: null, cached_s: null,
-};
-
 export class Recording {
   /** @param {Link} link */
   constructor(link) {
     this.link = link;
     this.mayRecord = true;
-    this._status = NO_ANSWER;
+    /** @type {RecordingStatus | null} The newest status; null: none yet. */
+    this._status = null;
     /** @type {number | null} Number of the last notice. */
     this._notice = null;
     byId("snapshot").addEventListener("click", () => this._send({ type: "snapshot" }));
   }
 
   get running() {
-    return RUNNING.includes(this._status.state);
+    return RUNNING.includes(this._status?.state ?? "");
   }
 
   /** Starts or stops a recording. */
   toggle() {
-    if (this._status.recorder !== "ok" && this.mayRecord) toast(this._status.text);
+    if (this._status?.recorder !== "ok" && this.mayRecord) toast(this._status?.text ?? "The recorder has not answered yet.");
     else this._send({ type: "record", on: !this.running });
   }
 

@@ -1,4 +1,4 @@
-// Where the page shows its images from, and the colours that they take at a switch.
+// Places from which the page shows its images, and their colours at a switch.
 
 import assert from "node:assert/strict";
 import { test } from "node:test";

@@ -1,4 +1,4 @@
-// The WebSocket: connecting, losing and finding the server again; what arrives is checked.
+// The WebSocket: connecting, losing and finding the server again; checks of what arrives.
 
 import assert from "node:assert/strict";
 import { beforeEach, mock, test } from "node:test";

@@ -1,4 +1,4 @@
-// What the page accepts from the server.
+// Checks of the server's messages.
 
 import assert from "node:assert/strict";
 import { test } from "node:test";

@@ -1,4 +1,4 @@
-// Which text the operator gets; chosen by codes, never by wording.
+// The operator's texts, chosen by codes, never by wording.
 
 import assert from "node:assert/strict";
 import { test } from "node:test";
