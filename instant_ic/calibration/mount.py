@@ -114,10 +114,13 @@ class _EdgeLevel:
 
     def each(self, camera_from_lidar: Matrix) -> NDArray[np.float64]:
         """Return the weighted strength under each edge point, (N,)."""
-        from instant_ic.calibration.kernels import strength_under
+        from scipy.ndimage import map_coordinates
 
-        strength = np.empty(len(self.plane))
-        strength_under(self.edges.points, self.plane, self.strengths, camera_from_lidar, strength)
+        height, width = self.strengths.shape[1], self.strengths.shape[2] - 1
+        x, y, z = transform_points(camera_from_lidar, self.edges.points).T
+        u = ((np.pi - np.arctan2(y, x)) * (width / (2 * np.pi)) - 0.5) % width
+        v = (np.pi / 2 - np.arctan2(z, np.hypot(x, y))) * (height / np.pi) - 0.5
+        strength = map_coordinates(self.strengths, (self.plane, v, u), np.float64, order=1, mode="nearest")
         return np.asarray(self.edges.weight * strength)
 
     def score(self, camera_from_lidar: Matrix) -> float:
