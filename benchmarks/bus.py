@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""The bus compared with other middleware: latency, throughput and fan-out between processes, in one run.
+"""The bus compared with other middleware: latency and fan-out between processes, in one run.
 
     python benchmarks/bus.py --json bus.json     (about 12 minutes)
     python benchmarks/bus.py --quick             (about 2 minutes)
@@ -83,18 +83,18 @@ class PeerPair:
     pub: BusPeer
     subs: list[BusPeer]
 
-    def send(self, topic: str, count: int, period_s: float, seconds: float = 60.0) -> tuple[int, float, list[Receiver]]:
-        """Send frames, wait until all have arrived, and return count, seconds, and what each reader got."""
-        sent, took = self.pub.ask((topic, count, period_s, seconds))
+    def send(self, topic: str, count: int, period_s: float) -> list[Receiver]:
+        """Send frames, wait until all have arrived, and return what each reader got."""
+        self.pub.ask((topic, count, period_s))
         quiet_s, before = time.monotonic() + QUIET_S, 0
         while time.monotonic() < quiet_s:
             counts = [sub.ask("count") for sub in self.subs]
-            if min(counts) >= sent:
+            if min(counts) >= count:
                 break
             if sum(counts) > before:
                 quiet_s, before = time.monotonic() + QUIET_S, sum(counts)
             time.sleep(0.05)
-        return sent, took, [sub.ask("all") for sub in self.subs]
+        return [sub.ask("all") for sub in self.subs]
 
     def warm_up(self, topic: str) -> None:
         """Wait until every reader receives from the publisher.
@@ -107,7 +107,7 @@ class PeerPair:
         while not all(heard):
             if time.monotonic() > deadline:
                 raise RuntimeError(f"nothing came on {topic}")
-            _, _, got = self.send(topic, 5, 0.03)
+            got = self.send(topic, 5, 0.03)
             heard = [h or bool(one.latencies_us) for h, one in zip(heard, got, strict=True)]
 
     def close(self) -> None:
@@ -146,9 +146,9 @@ def open_pair(transport: str, address: str, topics: dict[str, int], readers: int
         raise
 
 
-def measure(transports: list[str], rounds: int, count: int, flood_s: float) -> dict[str, Any]:
+def measure(transports: list[str], rounds: int, count: int) -> dict[str, Any]:
     """Return all figures by transport."""
-    result: dict[str, Any] = {"not_measured": {}, "latency": {}, "throughput": {}, "fanout": {}}
+    result: dict[str, Any] = {"not_measured": {}, "latency": {}, "fanout": {}}
     with tempfile.TemporaryDirectory(prefix="ic") as folder:
         address = addresses(Path(folder))
         with contextlib.ExitStack() as ends:
@@ -161,12 +161,6 @@ def measure(transports: list[str], rounds: int, count: int, flood_s: float) -> d
                     result["not_measured"][transport] = str(error)
                     note(f"{transport}: not measured: {error}")
             result["latency"] = latencies(pairs, rounds, count)
-        for transport in pairs:
-            try:
-                result["throughput"][transport] = flood(transport, address[transport], flood_s)
-                note(f"throughput, {transport}")
-            except RuntimeError as error:
-                note(f"{transport}: throughput not measured: {error}")
         result["fanout"] = fanout({name: address[name] for name in pairs}, max(1, rounds // 2), count)
     return result
 
@@ -177,7 +171,7 @@ def latencies(pairs: dict[str, PeerPair], rounds: int, count: int) -> dict[str, 
     for turn in range(rounds):
         for topic in SIZES:
             for name, pair in pairs.items():
-                _, _, (got,) = pair.send(topic, count, PERIOD_S[topic])
+                (got,) = pair.send(topic, count, PERIOD_S[topic])
                 gathered[name][topic] += got.latencies_us
         note(f"latency, round {turn + 1} of {rounds}")
     return {name: {size: summary(values, "us") for size, values in sizes.items()} for name, sizes in gathered.items()}
@@ -190,29 +184,13 @@ def fanout(address: dict[str, str], rounds: int, count: int) -> dict[str, Any]:
         for name in address:
             try:
                 with contextlib.closing(open_pair(name, address[name], {"m5": SIZES["m5"]}, FANOUT)) as pair:
-                    _, _, got = pair.send("m5", count, PERIOD_S["m5"])
+                    got = pair.send("m5", count, PERIOD_S["m5"])
             except RuntimeError as error:
                 note(f"{name}: fan-out not measured: {error}")
                 continue
             gathered[name] += [value for one in got for value in one.latencies_us]
         note("fan-out")
     return {name: summary(values, "us") for name, values in gathered.items()}
-
-
-def flood(transport: str, address: str, seconds: float) -> dict[str, Any]:
-    """Return the throughput by size when the sender never waits."""
-    topics = {f"flood_{name}": size for name, size in SIZES.items()}
-    cells = {}
-    with contextlib.closing(open_pair(transport, address, topics, 1)) as pair:
-        for topic in topics:
-            sent, took, (got,) = pair.send(topic, 10**9, 0.0, seconds)
-            took, count = max(took, (got.last_ns - got.first_ns) / 1e9), len(got.latencies_us)
-            cells[topic.removeprefix("flood_")] = {
-                "mb_per_s": round(got.bytes / took / 1e6, 1),
-                "messages_per_s": round(count / took),
-                "delivered": round(count / max(1, sent), 4),
-            }
-    return cells
 
 
 def main() -> None:
@@ -222,11 +200,11 @@ def main() -> None:
     text = "; ".join(f"{key}: {name}" for key, name in NAMES.items())
     parser.add_argument("--only", nargs="+", choices=everything, default=everything, metavar="TRANSPORT", help=text)
     args = parser.parse_args()
-    rounds, count, flood_s = (2, 40, 0.5) if args.quick else (6, 100, 2.0)
+    rounds, count = (2, 40) if args.quick else (6, 100)
     result = {
         "cores": os.cpu_count(),
         "load_before": os.getloadavg()[0],
-        **measure(args.only, rounds, count, flood_s),
+        **measure(args.only, rounds, count),
         "load_after": os.getloadavg()[0],
     }
     report(result, args.json)

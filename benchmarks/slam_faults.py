@@ -1,7 +1,12 @@
 """SLAM under faults: each fault is put into a log at several places; error, detection, false alarms and recovery.
 
-The clean run is the reference: a pose is wrong if it is more than `WRONG_M` from the clean run's pose of the same scan.
-Relations or ground truth are not needed, so any log will do.
+1. ``_clean_run``: run the log as it is, and keep a copy of the SLAM before each place.
+2. A fault changes what the robot sees from a place on (``heading_jump``, ``gap``, ``blind``, ``kidnap``).
+3. ``_figures``: run the copy on that, and compare its poses with those of the clean run. A pose is wrong if it is more
+   than `WRONG_M` from the clean run's pose of the same scan.
+4. ``relocalizations``: switch robots on anywhere in the map of every second scan.
+
+The clean run is the reference. Relations or ground truth are not needed, so any log will do.
 """
 
 from __future__ import annotations
@@ -83,12 +88,13 @@ class CleanRun:
 def _part(entries: Sequence[LogEntry], at: int) -> range:
     """Return the indices of the scans from ``at`` for the time that a fault is followed."""
     end_ns = entries[at].scan.stamp_ns + int(HORIZON_S * 1e9)
-    last = at
-    while last < len(entries) and last - at < MOST_SCANS:
-        if entries[last].scan.stamp_ns > end_ns and last - at >= LEAST_SCANS:
-            break
-        last += 1
-    return range(at, last)
+    in_time = sum(entry.scan.stamp_ns <= end_ns for entry in entries[at : at + MOST_SCANS])
+    return range(at, min(len(entries), at + max(in_time, LEAST_SCANS)))
+
+
+def _seen_again_at(entries: Sequence[LogEntry], at: int) -> int:
+    """Return the stamp in ns until which the scans of a gap that begins after scan ``at`` − 1 are lost."""
+    return entries[at - 1].scan.stamp_ns + int(GAP_S * 1e9)
 
 
 def _moved_odometry(entry: LogEntry, moved: FloatArray) -> LogEntry:
@@ -108,16 +114,15 @@ def heading_jump(entries: Sequence[LogEntry], at: int, end: int, rng: np.random.
 
 def gap(entries: Sequence[LogEntry], at: int, end: int, rng: np.random.Generator) -> Faulted:
     """Leave out the scans of ten seconds; odometry goes on."""
-    until_ns = entries[at - 1].scan.stamp_ns + int(GAP_S * 1e9)
-    part = [k for k in range(at, end) if entries[k].scan.stamp_ns >= until_ns]
+    part = [k for k in range(at, end) if entries[k].scan.stamp_ns >= _seen_again_at(entries, at)]
     return Faulted([entries[k] for k in part], np.array(part, dtype=np.intp))
 
 
 def blind(entries: Sequence[LogEntry], at: int, end: int, rng: np.random.Generator) -> Faulted:
     """Remove all returns from the scans of ten seconds; odometry goes on."""
-    until_ns = entries[at - 1].scan.stamp_ns + int(GAP_S * 1e9)
-    shown = [_with_ranges(e, np.full(len(e.scan.ranges), np.inf)) if e.scan.stamp_ns < until_ns else e
-             for e in entries[at:end]]  # fmt: skip
+    until_ns = _seen_again_at(entries, at)
+    empty = [replace(e, scan=replace(e.scan, ranges=np.full_like(e.scan.ranges, np.inf))) for e in entries[at:end]]
+    shown = [e if e.scan.stamp_ns < until_ns else entry for e, entry in zip(empty, entries[at:end], strict=True)]
     return Faulted(shown, np.arange(at, end))
 
 
@@ -132,13 +137,9 @@ def kidnap(entries: Sequence[LogEntry], at: int, end: int, there: int, rng: np.r
     for k in part:
         entry = _moved_odometry(entries[k], moved)
         ranges = entry.scan.ranges + RANGE_NOISE_M * rng.standard_normal(len(entry.scan.ranges))
-        entry = _with_ranges(entry, ranges)
-        shown.append(replace(entry, scan=replace(entry.scan, stamp_ns=entry.scan.stamp_ns + begin_ns)))
+        scan = replace(entry.scan, ranges=ranges, stamp_ns=entry.scan.stamp_ns + begin_ns)
+        shown.append(replace(entry, scan=scan))
     return Faulted(shown, np.array(part))
-
-
-def _with_ranges(entry: LogEntry, ranges: FloatArray) -> LogEntry:
-    return replace(entry, scan=replace(entry.scan, ranges=ranges))
 
 
 PLACE_FAULTS: dict[str, Callable[[Sequence[LogEntry], int, int, np.random.Generator], Faulted]] = {
