@@ -78,7 +78,7 @@ def train(args: argparse.Namespace) -> int:
 
         manifest = export_model(
             load_completion(args.checkpoint), args.export, args.export.stem, LICENCE, trainer.config.max_range_m,
-            record=trainer.record(), half_weights=True, brightness=trainer.config.brightness,
+            record=trainer.record(), brightness=trainer.config.brightness,
         )  # fmt: skip
         print(f"wrote {args.export} ({args.export.stat().st_size / 1e6:.1f} MB, {manifest.sha256[:12]})", flush=True)
     return 0

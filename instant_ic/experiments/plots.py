@@ -115,18 +115,6 @@ Series: TypeAlias = dict[str, dict[float, list[float]]]
 """Name → x → values, of which mean and standard deviation are plotted."""
 _INK = "#010203"
 """Replaced by the page's text colour."""
-_COLOURS = (
-    "#0072B2",
-    "#D55E00",
-    "#009E73",
-    "#CC79A7",
-    "#E69F00",
-    "#56B4E9",
-    "#8A8A8A",
-    "#B8860B",
-    "#7B5EA7",
-    "#C44E52",
-)
 
 
 def curves_svg(panels: Sequence[tuple[str, str, Series]]) -> str:
@@ -136,7 +124,7 @@ def curves_svg(panels: Sequence[tuple[str, str, Series]]) -> str:
         panels: label of x, label of y, and the curves; the same name has the same colour in all panels.
     """
     names = list(dict.fromkeys(name for _, _, series in panels for name in series))
-    colours = {name: series_colour(number) for number, name in enumerate(names)}
+    colours = {name: f"C{number % 10}" for number, name in enumerate(names)}
     return "".join(_curves_svg(*panel, colours) for panel in panels)
 
 
@@ -152,11 +140,6 @@ def _curves_svg(x_label: str, y_label: str, series: Series, colours: dict[str, s
     axis.set_ylabel(y_label)
     figure.legend(loc="outside lower center", ncols=4, fontsize=7, frameon=False, labelcolor=_INK)
     return figure_svg(figure, axis)
-
-
-def series_colour(number: int) -> str:
-    """Return the colour of a curve or a group, by its number."""
-    return _COLOURS[number % len(_COLOURS)]
 
 
 def figure_svg(figure: Any, axis: Any) -> str:

@@ -19,14 +19,12 @@ TOPIC = "/keyframe"
 
 
 @contextlib.contextmanager
-def opened(
-    bag: Path, kinds: Mapping[str, tuple[str, ...]], remedy: str = "", optional: str = ""
-) -> Iterator[BagReader]:
+def opened(bag: Path, kinds: Mapping[str, str], remedy: str = "", optional: str = "") -> Iterator[BagReader]:
     """Open a bag that has these topics.
 
     Args:
         bag: folder or file.
-        kinds: types that each topic may have, without their package.
+        kinds: type of each topic, without its package.
         remedy: advice at the end of the error if a topic is missing.
         optional: topic that may be missing.
 
@@ -36,16 +34,11 @@ def opened(
     try:
         with BagReader(bag) as reader:
             types = {one.topic: one.type_name.rpartition("/")[2] for one in reader.topics}
-            if missing := [topic for topic in kinds if topic not in types and topic != optional]:
-                lacks = f"{', '.join(missing)} {'is' if len(missing) == 1 else 'are'} missing"
-                has = ", ".join(sorted(types)) or "none"
-                raise ValueError(f"{bag}: {lacks}; the bag has these topics: {has}{remedy}")
-            if wrong := [
-                f"{topic} has the type {types[topic]}, not {allowed[0]}"
-                for topic, allowed in kinds.items()
-                if types.get(topic, allowed[0]) not in allowed
-            ]:
-                raise ValueError(f"{bag}: {'; '.join(wrong)}")
+            for topic, kind in kinds.items():
+                if topic not in types and topic != optional:
+                    raise ValueError(f"{bag}: {topic} is missing; the bag has {', '.join(sorted(types))}{remedy}")
+                if (found := types.get(topic, kind)) != kind:
+                    raise ValueError(f"{bag}: {topic} has the type {found}, not {kind}")
             yield reader
     except BagError as error:
         raise ValueError(str(error)) from error
@@ -89,7 +82,7 @@ def later_keyframes(
 
 
 def _messages(bag: Path) -> list[Any]:
-    with opened(bag, {TOPIC: ("Keyframe",)}, ". Record it again") as reader:
+    with opened(bag, {TOPIC: "Keyframe"}, ". Record it again") as reader:
         messages = [deserialize(one.payload, one.type_name) for one in reader.messages([TOPIC])]
     fit = [message for message in messages if message.fit]
     if len(fit) < 2:

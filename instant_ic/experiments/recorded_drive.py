@@ -20,7 +20,7 @@ from instant_ic.geometry.poses import pose_matrix
 from instant_ic.slam.occupancy import OccupancyGrid
 
 STATE, MAP, CAMERA, KEYFRAME = "/ic/state", "/map", "/camera/image/compressed", "/keyframe"
-TYPES = {STATE: ("ControlState",), MAP: ("OccupancyGrid",), CAMERA: ("CompressedImage",), KEYFRAME: ("Keyframe",)}
+TYPES = {STATE: "ControlState", MAP: "OccupancyGrid", CAMERA: "CompressedImage", KEYFRAME: "Keyframe"}
 SIZE = (320, 180)
 _BESIDE_S = 1.0
 """The first and the last still are this long before and after the virtual space."""

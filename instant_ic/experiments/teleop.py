@@ -26,8 +26,6 @@ from instant_ic.experiments.teleop_operator import ScriptedOperator, Sight
 from instant_ic.experiments.teleop_stack import (
     CAMERA_HEIGHT_M,
     METHODS,
-    NODES,
-    VSPACE_NODES,
     SimulatedStack,
     StackConfig,
 )
@@ -212,16 +210,12 @@ def run_episode(
 
 @contextlib.contextmanager
 def _quiet() -> Iterator[None]:
-    """Limit the nodes' loggers to errors: their warnings during start-up are expected."""
-    loggers = [logging.getLogger(name) for name in (*NODES, *VSPACE_NODES)]
-    levels = [logger.level for logger in loggers]
+    """Hide warnings: those of the nodes during start-up are expected."""
+    logging.disable(logging.WARNING)
     try:
-        for logger in loggers:
-            logger.setLevel(logging.ERROR)
         yield
     finally:
-        for logger, level in zip(loggers, levels, strict=True):
-            logger.setLevel(level)
+        logging.disable(logging.NOTSET)
 
 
 def evaluate(

@@ -29,19 +29,19 @@ class ExportError(RuntimeError):
     """The exported file's output differs from the network's."""
 
 
-def export_onnx(model: CompletionNet, path: str | Path, half_weights: bool = False) -> dict[str, float]:
+def export_onnx(model: CompletionNet, path: str | Path) -> dict[str, float]:
     """Export the network as ONNX of fixed shape and compare it with torch on a random image.
 
-    Batch norms are folded into the convolutions before them.
+    Batch norms are folded into the convolutions before them. Weights are stored as float16; inference computes in
+    float32.
 
     Args:
         model: the network; switched to evaluation mode.
         path: file to write; replaced only after all checks have passed.
-        half_weights: store the weights as float16 (half the size); inference computes in float32.
 
     Returns:
         ``difference``: largest |onnx - torch| over the largest |torch|, with float32 weights; ``half_difference``: the
-        same for the file with float16 weights, if those are written.
+        same for the file.
 
     Raises:
         ExportError: a difference is too large, or the network's output is not finite.
@@ -66,11 +66,10 @@ def export_onnx(model: CompletionNet, path: str | Path, half_weights: bool = Fal
         result = {"difference": _difference(_run(plain, inputs), expected)}
         if not result["difference"] < MAX_RELATIVE_DIFFERENCE:
             raise ExportError(f"largest difference to torch: {result['difference']:.1e} of the largest depth")
-        if half_weights:
-            plain.write_bytes(_halve_weights(plain.read_bytes()))
-            result["half_difference"] = _difference(_run(plain, inputs), expected)
-            if not result["half_difference"] < MAX_HALF_DIFFERENCE:
-                raise ExportError(f"float16 weights change the depth by {result['half_difference']:.1e}")
+        plain.write_bytes(_halve_weights(plain.read_bytes()))
+        result["half_difference"] = _difference(_run(plain, inputs), expected)
+        if not result["half_difference"] < MAX_HALF_DIFFERENCE:
+            raise ExportError(f"float16 weights change the depth by {result['half_difference']:.1e}")
         with replacing(path) as file:
             file.write(plain.read_bytes())
     return result
@@ -128,7 +127,6 @@ def export_model(
     licence: str,
     max_range_m: float,
     record: dict[str, Any] | None = None,
-    half_weights: bool = False,
     brightness: float = 0.0,
 ) -> ModelManifest:
     """Write ``NAME.onnx``, its manifest ``NAME.yaml`` and, if given, the training record ``NAME.json``.
@@ -139,7 +137,7 @@ def export_model(
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    differences = export_onnx(model, path, half_weights)
+    differences = export_onnx(model, path)
     manifest = ModelManifest(
         model=path.name,
         name=name,
