@@ -79,9 +79,12 @@ class BagRecorderNode(Node[BagRecorderConfig]):
         self.recorder.tick()
 
     def _snapshot(self, reason: str = "") -> dict[str, Any]:
-        made = self.recorder.snapshot(reason, self.config.snapshot_after_s)
-        self.log.info("snapshot %s in %.1f s", made.path, max(0.0, made.due_s - time.monotonic()))
-        return {"path": str(made.path)}
+        try:
+            path = self.recorder.snapshot(reason, self.config.snapshot_after_s).path
+        except BagError as error:
+            raise NodeError(str(error)) from None
+        self.log.info("snapshot %s, with %g s more", path, self.config.snapshot_after_s)
+        return {"path": str(path)}
 
     def _record(self, name: str = "") -> dict[str, Any]:
         try:
@@ -96,7 +99,10 @@ class BagRecorderNode(Node[BagRecorderConfig]):
         before = self._stopped.get(who)
         self._stopped[who] = stopped
         if stopped and before is False:
-            self._snapshot("estop")
+            try:
+                self._snapshot("estop")
+            except (ValueError, NodeError) as error:
+                self.log.error("no snapshot of the stop: %s", error)
 
     def teardown(self) -> None:
         if not hasattr(self, "recorder"):

@@ -6,7 +6,7 @@ memory, writes them into a bag on request, and records into a further bag betwee
 
 from __future__ import annotations
 
-import logging
+import math
 import os
 import shutil
 import time
@@ -20,7 +20,7 @@ from typing import Annotated, Any
 from instant_ic.bag.choice import TopicChoice
 from instant_ic.bag.message import BagError, BagMessage
 from instant_ic.bag.recording import ENDING, RECORDING, BagOptions, Recording, counts_text, low_text
-from instant_ic.bag.snapshot import BagSnapshot, SnapshotCache
+from instant_ic.bag.snapshot import SnapshotCache
 from instant_ic.bus.qos import PRESETS, SENSOR, QoS
 from instant_ic.bus.registry import NodeInfo, TopicInfo
 from instant_ic.bus.transport import Stats
@@ -33,8 +33,6 @@ FOREIGN_CLOCK_NS = 10_000_000_000
 _MB = 1_000_000
 _RECENT_S = 10.0  # losses longer ago are no warning
 _IDLE = "idle"
-
-log = logging.getLogger(__name__)
 
 TakeMessage = Callable[..., None]
 """Accepts ``(topic, type_name, payload, publish_ns, publisher)``; see :meth:`Recorder.take`."""
@@ -87,7 +85,7 @@ class Recorder:
 
     Attributes:
         bag: the bag that is being written, or the last one; None before the first one in snapshot mode.
-        snapshots: all snapshots so far.
+        snapshots: bags of the snapshots so far.
 
     Raises:
         BagError: the bag cannot be created.
@@ -105,7 +103,7 @@ class Recorder:
         self.path = path
         self.options = options or BagRecorderConfig()
         self.bag: Recording | None = None
-        self.snapshots: list[BagSnapshot] = []
+        self.snapshots: list[Recording] = []
         self._choice = choice
         self._subscribe = subscribe
         self._sim_now_ns = sim_now_ns
@@ -125,8 +123,7 @@ class Recorder:
     @property
     def failed(self) -> bool:
         """True if the last bag or a snapshot is incomplete."""
-        states = [snapshot.state for snapshot in self.snapshots]
-        return "failed" in states or (self.bag is not None and self.bag.failed)
+        return any(bag.failed for bag in self._bags)
 
     def discover(self, topics: Collection[TopicInfo], nodes: Collection[NodeInfo] = ()) -> None:
         """Subscribe to new selected topics and store the parameters of nodes."""
@@ -149,8 +146,8 @@ class Recorder:
         message = BagMessage(topic, type_name, bytes(payload), stamp_ns, self._qos.get(topic, SENSOR), publisher)
         if self._cache is not None:
             self._cache.add(message, time.monotonic())
-        if self.bag is not None:
-            self.bag.put(message)
+        for bag in self._bags:
+            bag.put(message)
 
     def record(self, name: str = "") -> Path:
         """Start a bag ``rec_DATE_TIME_NAME`` and return its folder; for snapshot mode.
@@ -180,26 +177,28 @@ class Recorder:
         self.bag.finish()
         return self.bag.path
 
-    def snapshot(self, reason: str = "", after_s: float = 0.0) -> BagSnapshot:
-        """Write the messages in memory into a separate bag after ``after_s`` more seconds.
+    def snapshot(self, reason: str = "", after_s: float = 0.0) -> Recording:
+        """Begin a bag ``DATE_TIME_REASON`` with the messages in memory, which ends after ``after_s`` more seconds.
 
         Raises:
-            ValueError: not in snapshot mode.
+            ValueError: not in snapshot mode, or no message has been received.
+            BagError: the bag cannot be created.
         """
-        self._snapshot_cache()
-        for waiting in self.snapshots:
-            if waiting.state == "waiting":  # a pending snapshot will contain this moment too
-                return waiting
-        found = BagSnapshot(_dated(self.path, reason), due_s=time.monotonic() + after_s)
-        self.snapshots.append(found)
+        content = self._snapshot_cache().content()
+        if not content:
+            raise ValueError("no message has been received yet: there is nothing to write")
+        for snapshot in self.snapshots:
+            if snapshot.state == RECORDING:  # it contains this moment too
+                return snapshot
+        path, until_s = _dated(self.path, reason), time.monotonic() + after_s
+        self.snapshots.append(self._open(path, content, until_s))
         self.tick()
-        return found
+        return self.snapshots[-1]
 
     def tick(self) -> None:
-        """Write the snapshots that are due."""
-        for waiting in self.snapshots:
-            if waiting.state == "waiting" and time.monotonic() >= waiting.due_s:
-                self._write_snapshot(waiting)
+        """End the snapshots that are complete."""
+        for bag in self._bags:
+            bag.tick()
 
     def lost_by(self) -> dict[str, dict[str, int]]:
         """Return the messages lost in transit: topic → publisher → messages."""
@@ -251,14 +250,10 @@ class Recorder:
         Raises:
             BagError: a bag could not be written completely.
         """
-        for waiting in self.snapshots:
-            if waiting.state == "waiting":
-                self._write_snapshot(waiting)
         errors = []
-        for bag in (self.bag, *(snapshot.recording for snapshot in self.snapshots)):
+        for bag in self._bags:
             try:
-                if bag is not None:
-                    bag.close(timeout_s)
+                bag.close(timeout_s)
             except BagError as error:
                 errors.append(str(error))
         if errors:
@@ -266,10 +261,15 @@ class Recorder:
 
     # -- internals -------------------------------------------------------------------------------
 
+    @property
+    def _bags(self) -> list[Recording]:
+        return [*self.snapshots, *([self.bag] if self.bag is not None else [])]
+
     def _open(
         self,
         path: Path,
         content: Collection[BagMessage] = (),
+        until_s: float = math.inf,
         lost_before: Mapping[str, Mapping[str, int]] | None = None,
     ) -> Recording:
         """Return a new bag; its metadata contain the losses since ``lost_before``."""
@@ -279,21 +279,7 @@ class Recorder:
             grown = {topic: Counter(by) - Counter(before.get(topic, {})) for topic, by in self.lost_by().items()}
             return {"lost_by": {topic: by for topic, by in grown.items() if by}, "parameters": dict(self._parameters)}
 
-        return Recording(path, self.options, custom, content, self._free_bytes)
-
-    def _write_snapshot(self, snapshot: BagSnapshot) -> None:
-        content = self._snapshot_cache().content()
-        try:
-            if not content:
-                raise BagError(f"snapshot {snapshot.path}: no message has been received yet")
-            snapshot.recording = self._open(snapshot.path, content)
-        except BagError as error:  # concerns this snapshot only: the next may succeed
-            snapshot.text = str(error)
-            log.error("%s", error)
-            return
-        span_s = (max(m.stamp_ns for m in content) - min(m.stamp_ns for m in content)) / 1e9
-        snapshot.text = f"{len(content)} messages, {span_s:.1f} s"
-        snapshot.recording.finish()
+        return Recording(path, self.options, custom, content, until_s, self._free_bytes)
 
     def _snapshot_cache(self) -> SnapshotCache:
         if self._cache is None:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 import logging
+import math
 import shutil
 import threading
 import time
@@ -65,7 +66,8 @@ class Recording:
     Args:
         path: folder of the bag, which must not exist.
         custom: returns the values to store with the bag, by name.
-        content: messages of the past, oldest first, that are written whatever the size of the queue.
+        content: messages of the past, oldest first, with which the bag begins.
+        until_s: time at which the bag ends, by the monotonic clock; see :meth:`tick`.
         free_bytes: free space on the disk of a folder; replaced in tests.
 
     Attributes:
@@ -82,6 +84,7 @@ class Recording:
         options: BagOptions,
         custom: Callable[[], Mapping[str, Any]],
         content: Collection[BagMessage] = (),
+        until_s: float = math.inf,
         free_bytes: Callable[[Path], int] = lambda path: shutil.disk_usage(path).free,
     ) -> None:
         self.path = path
@@ -90,18 +93,19 @@ class Recording:
         self._state = RECORDING
         self._custom = custom
         self._free_bytes = free_bytes
-        self._max_bytes = options.queue_mb * _MB
+        self._until_s = until_s
         self._reserve = options.min_free_mb * _MB
         self._writer = BagWriter(path, options.compressed, options.max_bag_size, options.max_bag_duration)
         self._begun_s, self._ended_s = time.monotonic(), 0.0
         self._report = True
-        self._begun_ns = 0
+        self._begun_ns = min((message.stamp_ns for message in content), default=0)
         self._held: list[BagMessage] = []
         self._error = ""
         self._skipped: Counter[str] = Counter()  # replaced, never changed: another thread reads it
         self._queue = deque(content)
         self._pending = len(content)  # queued, or in the hands of the thread
         self._pending_bytes = sum(len(message.payload) for message in content)
+        self._max_bytes = options.queue_mb * _MB + self._pending_bytes
         self._changed = threading.Condition()
         self._thread = threading.Thread(target=self._run, name="bag writer", daemon=True)
         self._thread.start()
@@ -139,6 +143,11 @@ class Recording:
                 return
             self._begin(message.stamp_ns)
         self._enqueue(message)
+
+    def tick(self) -> None:
+        """End the bag when its time has come."""
+        if time.monotonic() >= self._until_s:
+            self.finish()
 
     def finish(self, report: bool = True) -> None:
         """Stop taking messages; the thread writes what is queued, and completes the bag.

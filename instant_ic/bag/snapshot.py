@@ -3,42 +3,10 @@
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import dataclass, replace
-from pathlib import Path
+from dataclasses import replace
 
 from instant_ic.bag.latched import LatchedValues
 from instant_ic.bag.message import BagMessage
-from instant_ic.bag.recording import Recording
-
-
-@dataclass
-class BagSnapshot:
-    """One snapshot.
-
-    Attributes:
-        due_s: time at which it is written, by the monotonic clock.
-        recording: its bag, once it is being written.
-        text: content of the bag, or why it cannot be written.
-    """
-
-    path: Path
-    due_s: float
-    recording: Recording | None = None
-    text: str = ""
-
-    @property
-    def state(self) -> str:
-        """``waiting``, ``writing``, ``done`` or ``failed``."""
-        if self.recording is None:
-            return "failed" if self.text else "waiting"
-        if not self.recording.done:
-            return "writing"
-        return "failed" if self.recording.error else "done"
-
-    def status(self) -> dict[str, str]:
-        """Return the values that ``ic bag snapshot`` asks for."""
-        error = self.recording.error if self.recording is not None else ""
-        return {"path": str(self.path), "state": self.state, "text": error or self.text}
 
 
 class SnapshotCache:

@@ -51,11 +51,11 @@ def snapshot(args: argparse.Namespace) -> int:
     deadline_s = time.monotonic() + args.timeout
     while time.monotonic() < deadline_s:
         made = next(s for s in _call(recorder, "status")["snapshots"] if s["path"] == path)
-        if made["state"] == "done":
-            print(f"{path}: {made['text']}")
+        if made["error"]:
+            raise UserError(made["error"])
+        if made["state"] == "ended":
+            print(f"{path}: {made['messages']} messages, {made['bytes'] / 1e6:.1f} MB")
             return 0
-        if made["state"] == "failed":
-            raise UserError(made["text"])
         time.sleep(0.1)
     raise UserError(f"{node.name} did not write {path} within {args.timeout:g} s")
 

@@ -159,8 +159,7 @@ def test_snapshots_on_demand_and_at_an_emergency_stop(talker: Talker, tmp_path: 
         assert topics["/operator/estop"].count >= 1 and topics["/operator/estop"].qos.name == "latched"
         values = [deserialize(m.payload, m.type_name).data for m in reader.messages({"/count"})]
         assert len(values) > 1 and values == [values[0] + i for i in range(len(values))]
-        span_s = (reader.end_ns - reader.start_ns) / S
-        assert f"{sum(t.count for t in topics.values())} messages, {span_s:.1f} s" in done.stdout  # as the command said
+        assert f"{sum(t.count for t in topics.values())} messages" in done.stdout  # as the command said
     with BagReader(stopped) as reader:
         stops = [(m.stamp_ns, deserialize(m.payload, m.type_name).data) for m in reader.messages({"/operator/estop"})]
         assert [value for _, value in stops] == [False, True] and abs(stops[1][0] - pressed_ns) < 2 * S

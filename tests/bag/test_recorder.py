@@ -17,7 +17,7 @@ from instant_ic.bag import BagError, BagMessage, BagReader, recording
 from instant_ic.bag.choice import TopicChoice
 from instant_ic.bag.mcap_scan import McapScan
 from instant_ic.bag.recorder import BagRecorderConfig, Recorder
-from instant_ic.bag.recording import DISK_FULL, FAILED, RECORDING, Recording
+from instant_ic.bag.recording import DISK_FULL, ENDED, FAILED, RECORDING, Recording
 from instant_ic.bag.snapshot import SnapshotCache
 from instant_ic.bus import LATCHED, SENSOR
 from instant_ic.bus.qos import QoS
@@ -218,31 +218,40 @@ def test_snapshot_cache_keeps_the_last_seconds_and_what_was_latched_before() -> 
 
 def test_snapshots_are_bags_of_their_own(tmp_path: Path) -> None:
     recorder = recorder_of(tmp_path / "snaps", snapshot=True, snapshot_seconds=60.0)
+    with pytest.raises(ValueError, match="no message has been received yet"):
+        recorder.snapshot("early")
     recorder.take("/estop", BOOL, NO, 1 * S)
     recorder.take("/scan", BOOL, b"1", 2 * S)
     first = recorder.snapshot("door / stuck!")
-    wait_for(lambda: first.state == "done", "the snapshot")
+    wait_for(lambda: first.done, "the snapshot")
+    assert (first.state, first.status()["messages"]) == (ENDED, 2)
     recorder.take("/scan", BOOL, b"2", 3 * S)
-    second = recorder.snapshot("door / stuck!", after_s=0.05)
-    assert recorder.snapshot("again") is second  # what waits will hold this moment too
+    second = recorder.snapshot("door / stuck!", after_s=60.0)
+    assert recorder.snapshot("again") is second  # what is not complete holds this moment too
     recorder.take("/estop", BOOL, YES, 4 * S)
     recorder.close()  # also ends the wait
     assert first.path != second.path and "door___stuck" in first.path.name
-    assert [(m[0], m[2]) for m in read(first.path)] == [("/estop", NO), ("/scan", b"1")]
-    assert [(m[0], m[2]) for m in read(second.path)][-1] == ("/estop", YES)
-    assert [m[2] for m in read(second.path) if m[0] == "/scan"] == [b"1", b"2"]
-    assert second.state == "done" and second.text == "4 messages, 2.0 s"
+    assert read(first.path) == [("/estop", 2 * S, NO), ("/scan", 2 * S, b"1")]
+    assert read(second.path) == [
+        ("/estop", 2 * S, NO), ("/scan", 2 * S, b"1"), ("/scan", 3 * S, b"2"), ("/estop", 4 * S, YES),
+    ]  # fmt: skip
 
 
-def test_snapshot_that_cannot_be_written_is_told_and_the_next_succeeds(tmp_path: Path) -> None:
-    recorder = recorder_of(tmp_path / "snaps", snapshot=True, snapshot_seconds=60.0)
-    empty = recorder.snapshot("early")
-    wait_for(lambda: empty.state == "failed", "the failure")
-    assert "no message has been received yet" in empty.text
-    recorder.take("/scan", BOOL, b"1", 2 * S)
-    good = recorder.snapshot("late")
-    wait_for(lambda: good.state == "done", "the snapshot")
+def test_a_snapshot_ends_after_its_time_and_takes_more_than_the_queue_holds(tmp_path: Path) -> None:
+    recorder = recorder_of(tmp_path / "snaps", snapshot=True, queue_mb=1)
+    for second in range(1, 4):
+        recorder.take("/scan", BOOL, bytes([second]) * 1_000_000, second * S)
+    snapshot = recorder.snapshot(after_s=0.1)
+    recorder.take("/scan", BOOL, bytes([4]) * 1_000_000, 4 * S)
+
+    def ended() -> bool:
+        recorder.tick()
+        return snapshot.done
+
+    wait_for(ended, "the end")
+    recorder.take("/scan", BOOL, b"5", 5 * S)
     recorder.close()
+    assert [payload[0] for _, _, payload in read(snapshot.path)] == [1, 2, 3, 4] and not recorder.failed
 
 
 def on_the_disk(path: Path) -> list[bytes]:
