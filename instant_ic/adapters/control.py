@@ -22,9 +22,8 @@ from instant_ic.control.operator_view import OperatorView, PageReport
 from instant_ic.control.robot_lease import LEASE_S, RELEASED, Lease
 from instant_ic.control.snapshot import NO_MOTION, ArbiterInputs, Vspace
 from instant_ic.control.states import Mode
-from instant_ic.control.static_map import StaticMap
 from instant_ic.control.surroundings import ArrivedCloud, ArrivedScan, Surroundings
-from instant_ic.control.walls import WallMap
+from instant_ic.control.walls import StaticMap, WallMap
 from instant_ic.msg import (
     HARD_STOP,
     ControlState,

@@ -245,7 +245,6 @@ class Arbiter:
             stale_in_real=stale_in_real,
             fresh_s=self._since_s(self._fresh_since_ns, now_ns, -1.0),
             vspace=self._vspace(inputs, now_ns),
-            last_ready_vspace=None if self._ready is None else self._ready[0],
             target=target,
             vbot_pose=vbot,
             gap_m=gap_m,

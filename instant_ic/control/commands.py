@@ -60,7 +60,7 @@ class CommandRules:
         if s.leading_back:
             text = "No command: the view goes back to the robot. Drive to continue."
             return DriveCommand(NO_MOTION, Notice(Reason.LEADING_BACK, text), hard=hard)
-        text = "You drive the virtual robot." + _far_from_keyframe(s)
+        text = "You drive the virtual robot."
         if s.subgoal is None:
             text += " The robot has no free place near it."
             return DriveCommand(NO_MOTION, Notice(Reason.NO_SUBGOAL, text), hard=hard)
@@ -162,15 +162,3 @@ def why_stopped(s: Snapshot, stopped_by: Notice) -> Notice:
     if s.command != NO_MOTION or inputs.held_in_vain:
         return Notice(Reason.RELEASE_CONTROLS, f"{stopped_by.text} Let go of the controls to continue.")
     return stopped_by
-
-
-def _far_from_keyframe(s: Snapshot) -> str:
-    """Return the text for a v-bot outside the region that the virtual space shows well; "" inside."""
-    expected_db = s.inputs.vspace.expected_psnr_db
-    if 0.0 < expected_db < s.config.switch.min_expected_psnr_db:
-        return f" Most of the view is guessed here ({expected_db:.0f} dB expected)."
-    vspace = s.last_ready_vspace
-    away_m = 0.0 if vspace is None else float(np.linalg.norm(s.vbot_pose[:2] - vspace.position))
-    if vspace is None or away_m <= vspace.ready_radius_m:
-        return ""
-    return f" The view gets worse: its keyframe is {away_m:.1f} m away."

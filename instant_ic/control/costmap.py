@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from instant_ic.config.ranges import Plausible, Range, check_ranges
 from instant_ic.control.footprint import Footprint
 from instant_ic.control.heights import HeightConfig, HeightLayer, SortedPoints, shifted
-from instant_ic.control.static_map import OCCUPIED, StaticMap
+from instant_ic.control.walls import OCCUPIED, StaticMap
 
 FREE = 0
 INSCRIBED = 253

@@ -23,7 +23,7 @@ _YAW_MARGIN_RAD = 0.4
 """Margin when turning on the spot, in place of ``margin_m``."""
 _MAX_HORIZON_S = 8.0
 """Longest prediction, however slow the robot."""
-_STEP_S = 0.05
+STEP_S = 0.05
 """Seconds between predicted poses."""
 
 
@@ -46,10 +46,8 @@ class PredictionConfig(Checked):
 class Prediction:
     """A predicted trajectory and the obstacle it meets."""
 
-    times_s: NDArray[np.float64]
-    """(N,) seconds from now, first 0."""
     poses: NDArray[np.float64]
-    """(N, 3) x, y, yaw in the map frame."""
+    """(N, 3) x, y, yaw in the map frame, now and every ``STEP_S``."""
     hit_index: int | None
     """First pose whose footprint overlaps more obstacle than at the start; None when the way is free."""
     distance_m: float
@@ -58,7 +56,7 @@ class Prediction:
     @property
     def time_to_obstacle_s(self) -> float:
         """Seconds until the footprint meets the obstacle; inf when the way is free."""
-        return math.inf if self.hit_index is None else float(self.times_s[self.hit_index])
+        return math.inf if self.hit_index is None else STEP_S * self.hit_index
 
 
 def stopping_distance(speed_m_s: float, limits: MotionLimits, latency_s: float) -> float:
@@ -114,12 +112,11 @@ class Predictor:
             np.array(pose, dtype=np.float64),
             np.array(velocity, dtype=np.float64),
             np.array(command, dtype=np.float64),
-            rates * _STEP_S,
-            math.ceil(self.config.latency_s / _STEP_S - 1e-9),
+            rates * STEP_S,
+            math.ceil(self.config.latency_s / STEP_S - 1e-9),
             length,
             self.reach_m,
         )
-        times: NDArray[np.float64] = _STEP_S * np.arange(len(path), dtype=np.float64)
         hit = None
         if costmap is not None:
             body = self.body
@@ -129,7 +126,7 @@ class Predictor:
             # A robot that stands on an obstacle already (after a map jump) must not be blocked for good.
             worse = np.flatnonzero(overlap > overlap[0])
             hit = int(worse[0]) if worse.size else None
-        return Prediction(times, path, hit, math.inf if hit is None else float(travelled[hit]))
+        return Prediction(path, hit, math.inf if hit is None else float(travelled[hit]))
 
 
 def _speed(velocity: tuple[float, float], reach_m: float) -> float:
@@ -151,7 +148,7 @@ def _roll_out(
     The steps are those of ``kinematics.accelerate`` and ``move``. The command takes effect after ``late_steps``, and
     changes the velocity by at most ``steepest`` (2,) per step.
     """
-    most_steps = math.ceil(_MAX_HORIZON_S / _STEP_S)
+    most_steps = math.ceil(_MAX_HORIZON_S / STEP_S)
     poses, travelled = np.empty((most_steps + 1, 3)), np.zeros(most_steps + 1)
     poses[0] = pose
     v = velocity.copy()
@@ -163,9 +160,9 @@ def _roll_out(
         stands = v[0] == 0.0 and v[1] == 0.0 and command[0] == 0.0 and command[1] == 0.0
         if travelled[k] >= length_m or stands:
             break
-        x, y, yaw = _along_arc(poses[k, 0], poses[k, 1], poses[k, 2], v[0] * _STEP_S, v[1] * _STEP_S)
+        x, y, yaw = _along_arc(poses[k, 0], poses[k, 1], poses[k, 2], v[0] * STEP_S, v[1] * STEP_S)
         poses[k + 1, 0], poses[k + 1, 1] = x, y
         poses[k + 1, 2] = yaw - 2.0 * math.pi * math.floor(yaw / (2.0 * math.pi) + 0.5)
-        travelled[k + 1] = travelled[k] + (abs(v[0]) + reach_m * abs(v[1])) * _STEP_S
+        travelled[k + 1] = travelled[k] + (abs(v[0]) + reach_m * abs(v[1])) * STEP_S
         count += 1
     return poses[: count + 1], travelled[: count + 1]

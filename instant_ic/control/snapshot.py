@@ -134,8 +134,6 @@ class Snapshot:
     """Seconds for which every source that REAL needs has been fresh; -1 while one is stale."""
     vspace: Vspace
     """The virtual space, held for a short time while it learns its next keyframe."""
-    last_ready_vspace: Vspace | None
-    """The virtual space when it was last ready."""
     target: NDArray[np.float64]
     """(3,) pose of the r-bot as it is, or will be, shown."""
     vbot_pose: NDArray[np.float64]

@@ -14,7 +14,7 @@ from instant_ic.control.costmap import Costmap, CostmapConfig, RollingCostmap, s
 from instant_ic.control.footprint import Footprint
 from instant_ic.control.heights import SortedPoints, sort_points
 from instant_ic.control.moving import NOTHING_MOVES, MovingPoints, MovingThings
-from instant_ic.control.static_map import StaticMap
+from instant_ic.control.walls import StaticMap
 from instant_ic.geometry.poses import Matrix, inverse, pose2_from_matrix, relative2
 from instant_ic.geometry.transforms import TransformBuffer, TransformError
 from instant_ic.util.diagnosis import Diagnosis, Level

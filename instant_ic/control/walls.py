@@ -1,19 +1,35 @@
-"""Walls of the static map: long straight runs of occupied cells. Shorter runs are obstacles."""
+"""The static map and its walls: long straight runs of occupied cells. Shorter runs are obstacles."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from instant_ic.control.static_map import OCCUPIED, StaticMap
-
+OCCUPIED = 65
+"""Cells from this probability on are obstacles."""
 WALL_LENGTH_M = 1.5
 """A straight run of occupied map cells this long is a wall, a shorter one is an obstacle."""
 WALL_PERIOD_S = 2.0
 """Walls are searched for in a changed map at most this often."""
+
+
+@dataclass(frozen=True)
+class StaticMap:
+    """An occupancy grid: -1 unknown, 0..100 probability of being occupied."""
+
+    occupancy: NDArray[np.int8]
+    resolution: float
+    origin: NDArray[np.float64]
+
+    def __post_init__(self) -> None:
+        if self.occupancy.ndim != 2 or self.occupancy.size == 0:
+            raise ValueError(f"map must be a grid with cells (got shape {self.occupancy.shape})")
+        if not self.resolution > 0:
+            raise ValueError(f"map resolution must be > 0 (got {self.resolution})")
 
 
 class WallMap:

@@ -32,10 +32,9 @@ from instant_ic.control.passage import PassageConfig
 from instant_ic.control.planner import HybridPlanner, Plan, PlannerConfig
 from instant_ic.control.prediction import PredictionConfig, Predictor
 from instant_ic.control.safety import CollisionMonitor, CollisionMonitorConfig, MonitoredCommand
-from instant_ic.control.static_map import StaticMap
 from instant_ic.control.subgoal import choose_subgoal
 from instant_ic.control.vbot import VbotConfig, VirtualRobot
-from instant_ic.control.walls import WallMap
+from instant_ic.control.walls import StaticMap, WallMap
 from instant_ic.control.warmup import warm_up
 from instant_ic.experiments import follow_worlds as worlds
 from instant_ic.experiments.plots import new_figure, save_figure

@@ -16,7 +16,7 @@ from instant_ic.cli import kernels
 from instant_ic.cli.main import main
 from instant_ic.control import costmap
 from instant_ic.control.footprint import Footprint
-from instant_ic.control.static_map import StaticMap
+from instant_ic.control.walls import StaticMap
 from instant_ic.slam import loop_search
 from instant_ic.vspace import fill_kernels
 

@@ -22,9 +22,8 @@ from instant_ic.control.navigator import Navigator, meeting_pose
 from instant_ic.control.planner import HybridPlanner, PlannerConfig
 from instant_ic.control.snapshot import ArbiterInputs, Vspace
 from instant_ic.control.states import Mode, VbotAction
-from instant_ic.control.static_map import StaticMap
 from instant_ic.control.vbot import VbotConfig, VirtualRobot
-from instant_ic.control.walls import WallMap
+from instant_ic.control.walls import StaticMap, WallMap
 from instant_ic.msg import VspaceStatus, header, pose_message, to_time
 from instant_ic.util.contradiction import Contradiction
 

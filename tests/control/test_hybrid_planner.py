@@ -12,7 +12,7 @@ from instant_ic.control.follower import FollowerConfig, PathFollower
 from instant_ic.control.footprint import Footprint
 from instant_ic.control.kinematics import MotionLimits
 from instant_ic.control.planner import HybridPlanner, Plan, PlannerConfig
-from instant_ic.control.static_map import StaticMap
+from instant_ic.control.walls import StaticMap
 
 CELL = 0.05
 PLANNER = HybridPlanner(PlannerConfig())
