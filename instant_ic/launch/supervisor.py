@@ -83,6 +83,7 @@ class Supervisor:
         self._make_health = make_health
         self._health: HealthMonitor | None = None
         self._output_ended = threading.Event()
+        self._output_ended.set()  # start at once
         self._stop = False
         self._hurry = False
         self._status = 0
