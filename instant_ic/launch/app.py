@@ -113,7 +113,7 @@ class StackOutput:
     def close(self, status: int) -> None:
         """Show the remaining lines and remove the table; on a blocked terminal the process exits with ``status``."""
         self._outlet.put(self._screen.stop, always=True)
-        if not self._outlet.close(timeout_s=3.0):
+        if not self._outlet.close(timeout_s=2.0):
             # The blocked thread holds standard output, and the interpreter would wait for it forever. The nodes have
             # ended and the logs are written.
             os._exit(status)

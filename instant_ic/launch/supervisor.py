@@ -32,6 +32,7 @@ HANG_SCHEDULE: Schedule = ((signal.SIGABRT, 2.0), (signal.SIGKILL, 1.0))
 
 _HURRIED_SCHEDULE: Schedule = ((signal.SIGKILL, 1.0),)
 _ROUND_S = 0.25  # also the time to react to Ctrl-C; the end of a node is noticed at once
+_END_S = 0.01  # a process ends this soon after its output
 _LAST_LINES_S = 0.5
 _LAST_LOG_S = 2.0
 _REAPER = Path(__file__).with_name("reaper.py")
@@ -150,8 +151,9 @@ class Supervisor:
 
     def _step(self, wait_s: float) -> None:
         """Wait shortly, then move every process towards its wanted state."""
-        self._output_ended.wait(wait_s)
-        self._output_ended.clear()
+        if self._output_ended.wait(wait_s):
+            self._output_ended.clear()
+            time.sleep(_END_S)
         if self._health is not None:
             self._health.poll()
         self._reconcile(time.monotonic())
