@@ -4,15 +4,12 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from instant_ic.cli import completion
 from instant_ic.cli.arguments import launch_values, verb
-
-if TYPE_CHECKING:
-    from instant_ic.launch import LaunchArgument
+from instant_ic.cli.tables import print_table
 
 
 def add_parser(subparsers: Any) -> None:
@@ -56,7 +53,9 @@ def run(args: argparse.Namespace) -> int:
 
     file = find_launch_file(args.file)
     if args.show_args:
-        _show(file.name, read_arguments(file))
+        arguments = read_arguments(file)
+        rows = [(a.name, a.type, "required" if a.default is None else a.default, a.description) for a in arguments]
+        print_table(rows, ("ARGUMENT", "TYPE", "DEFAULT", "MEANING"))
         return 0
     run_dir = (args.run_dir or paths.run_dir()).absolute()
     description = read_launch_file(file, launch_values(args.arguments), run_dir)
@@ -89,12 +88,3 @@ def _pace(text: str) -> float | None:
         raise argparse.ArgumentTypeError(str(error)) from None
     except ValueError:
         raise argparse.ArgumentTypeError(f"must be a number or auto (got {text!r})") from None
-
-
-def _show(name: str, arguments: Sequence[LaunchArgument]) -> None:
-    print(f"arguments of {name}:{'' if arguments else ' none'}")
-    for argument in arguments:
-        default = "required" if argument.default is None else f"default: {argument.default!r}"
-        print(f"  {argument.name}: {argument.type} ({default})")
-        if argument.description:
-            print(f"      {argument.description}")
