@@ -18,11 +18,11 @@ from instant_ic.geometry.poses import pose_matrix
 from instant_ic.geometry.raycast import RayCaster
 from instant_ic.vspace.config import VirtualSpaceConfig
 from instant_ic.vspace.nerf.field import Floats, Rays
-from instant_ic.vspace.prior import KeyframeError, area_average
+from instant_ic.vspace.prior import KeyframeError, area_average, check_panorama, check_pose
 from instant_ic.vspace.readiness import UNSEEN_GAIN, Texture
 from instant_ic.vspace.space import SpaceState, SpaceStatus, VirtualSpace
 from instant_ic.vspace.texel_pyramids import TexelPyramids, texel_density
-from instant_ic.vspace.view import RayRenderer, View, checked_pose, continue_unseen, equirect_rays
+from instant_ic.vspace.view import RayRenderer, View, continue_unseen, equirect_rays
 
 EDGE_RATIO = 0.03
 """Neighbouring depths that differ by more than this share are an edge; its pixels are rendered by four rays."""
@@ -85,15 +85,11 @@ class MeshSpace(RayRenderer):
         Raises:
             KeyframeError: no panorama, or a pose that is none; all stays as it was.
         """
-        rgb, depth_m = np.asarray(rgb), np.asarray(depth_m, np.float32)
-        if rgb.dtype != np.uint8 or rgb.ndim != 3 or rgb.shape[2] != 3 or rgb.shape[1] != 2 * rgb.shape[0]:
-            raise KeyframeError(f"the panorama must be (H, 2 H, 3) uint8 (got {rgb.shape} {rgb.dtype})")
+        check_panorama(rgb)
+        check_pose(map_from_camera)
+        depth_m, pose = np.asarray(depth_m, np.float32), np.asarray(map_from_camera, np.float64)
         if depth_m.ndim != 2 or min(depth_m.shape) < 2:
             raise KeyframeError(f"depth must be (h, 2 h) (got {depth_m.shape})")
-        try:
-            pose = checked_pose(map_from_camera)
-        except ValueError as error:
-            raise KeyframeError(str(error)) from error
         width = min(_PROBE_WIDTH, rgb.shape[1])
         theirs: Floats = area_average(rgb, width // 2, width).astype(np.float32).reshape(-1, 3) / np.float32(255)
         rays = equirect_rays(pose, width)
@@ -141,21 +137,12 @@ class MeshSpace(RayRenderer):
         """Do nothing: there is nothing to train."""
 
     @property
-    def _psnr_db(self) -> float:
-        return psnr_of_mse(self._mse)
-
-    @property
     def status(self) -> SpaceStatus:
-        """READY at once. ``psnr_db``: of the mesh at the newest keyframe against the camera; NaN before the first."""
+        """READY at once; ``psnr_db`` compares the mesh with the newest keyframe's image and is NaN before the first."""
         corners = self._mesh.triangles.reshape(-1, 3)
         return SpaceStatus(
             state=SpaceState.READY,
-            refreshing=False,
-            psnr_db=self._psnr_db,
-            iterations=0,
-            train_seconds=0.0,
-            ready_iterations=0,
-            ms_per_iteration=0.0,
+            psnr_db=psnr_of_mse(self._mse),
             ready_radius_m=float(np.linalg.norm(np.ptp(corners, axis=0))),  # from any place in it to any other
             converged=True,
             source="mesh",

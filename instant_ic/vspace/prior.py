@@ -2,7 +2,7 @@
 
 ``prepare`` takes these steps:
 
-1. Check panorama, pose, depth and uncertainty (``_check_panorama``, ``_check_pose``, ``_checked_depth``,
+1. Check panorama, pose, depth and uncertainty (``check_panorama``, ``check_pose``, ``_checked_depth``,
    ``_checked_sigma``), and mark sky (``sky_region``) and the robot itself (``robot_region``).
 2. ``fill_holes``: fill unknown depth by a pyramid of weighted means (pull-push, Gortler et al., 1996).
 3. ``_cut_tops``: end assumed tops of things where the image does.
@@ -171,8 +171,8 @@ def prepare(
     Raises:
         KeyframeError: wrong shape or type, values that are not finite, too little depth, a pose that is none.
     """
-    _check_panorama(rgb)
-    _check_pose(map_from_camera)
+    check_panorama(rgb)
+    check_pose(map_from_camera)
     depth, content = _checked_depth(depth_m, config, robot)
     sigma, each = _checked_sigma(relative_sigma, depth_m, depth)
     rgb = shrunk(rgb, panorama_width)
@@ -210,7 +210,8 @@ def _cut_tops(
     cut_tops(inverse, sigma, colours, room, reach, *(np.float32(value) for value in tuning))
 
 
-def _check_panorama(rgb: NDArray[np.uint8]) -> None:
+def check_panorama(rgb: NDArray[np.uint8]) -> None:
+    """Check that an image is a panorama, (H, 2 H, 3) uint8, that shows something (else KeyframeError)."""
     if rgb.ndim != 3 or rgb.shape[2] != 3 or rgb.dtype != np.uint8:
         raise KeyframeError(f"panorama must be (H, W, 3) uint8 (got {rgb.shape} {rgb.dtype})")
     height, width = rgb.shape[:2]
@@ -220,7 +221,8 @@ def _check_panorama(rgb: NDArray[np.uint8]) -> None:
         raise KeyframeError("panorama has one colour only: covered lens or black image")
 
 
-def _check_pose(map_from_camera: NDArray[np.floating]) -> None:
+def check_pose(map_from_camera: NDArray[np.floating]) -> None:
+    """Check that a matrix is a pose near the map's origin (else KeyframeError)."""
     pose = np.asarray(map_from_camera, np.float64)
     if pose.shape != (4, 4) or not np.isfinite(pose).all():
         raise KeyframeError(f"pose must be a finite 4x4 matrix (got shape {pose.shape})")
@@ -365,13 +367,13 @@ def edge_quads(inverse_depth: NDArray[np.float32], ratio: float) -> NDArray[np.u
     width = inverse.shape[1]
     columns = np.pad(inverse, ((0, 0), (2, 3)), "wrap")
     rows = np.pad(inverse, ((2, 3), (0, 0)), "edge")
-    across = _torn_pairs([columns[:, k : k + width] for k in range(6)], ratio)
-    down = _torn_pairs([rows[k : k + len(inverse)] for k in range(6)], ratio)
+    across = _edge_pairs([columns[:, k : k + width] for k in range(6)], ratio)
+    down = _edge_pairs([rows[k : k + len(inverse)] for k in range(6)], ratio)
     depth_edge = across | np.concatenate([across[1:], across[-1:]]) | down | np.roll(down, -1, 1)
     return depth_edge.astype(np.uint8)
 
 
-def _torn_pairs(line: list[NDArray[np.float32]], ratio: float) -> NDArray[np.bool_]:
+def _edge_pairs(line: list[NDArray[np.float32]], ratio: float) -> NDArray[np.bool_]:
     """Return whether there is an edge between the third and the fourth of six pixels in a row."""
     first, before, a, b, after, last = line
     jump, nearest = np.abs(a - b), np.minimum(a, b)

@@ -68,17 +68,17 @@ class SpaceStatus:
     """
 
     state: SpaceState
-    refreshing: bool
     psnr_db: float
-    iterations: int
-    train_seconds: float
-    ready_iterations: int
-    ms_per_iteration: float
     ready_radius_m: float
     converged: bool
     source: str
     device: str
     warning: str = ""
+    refreshing: bool = False
+    iterations: int = 0
+    train_seconds: float = 0.0
+    ready_iterations: int = 0
+    ms_per_iteration: float = 0.0
     shows_field: bool = False
     gain_db: float = math.nan
 

@@ -9,7 +9,7 @@ import torch
 from instant_ic.geometry.poses import pose_matrix
 from instant_ic.vspace import FieldConfig, TrainConfig, VirtualSpaceConfig
 from instant_ic.vspace.config import GeometryConfig
-from instant_ic.vspace.nerf import volume, volume_reference
+from instant_ic.vspace.nerf import volume
 from instant_ic.vspace.nerf.field import VOLUME_SAMPLES, FieldParameters, Lattice, TrainingScene, ray_sources
 from instant_ic.vspace.nerf.kernels import no_marks
 from instant_ic.vspace.nerf.numba_device import NumbaDevice
@@ -18,6 +18,7 @@ from instant_ic.vspace.nerf.reference import TorchField, query, sample_rays
 from instant_ic.vspace.prior import MOVED, prepare
 from instant_ic.vspace.view import perspective_rays
 from tests import box_room
+from tests.vspace import volume_reference
 from tests.vspace.torch_device import TorchDevice, torch_priors
 
 F = np.float32

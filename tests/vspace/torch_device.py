@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from instant_ic.vspace.config import FieldConfig, TrainConfig
-from instant_ic.vspace.nerf import reference, volume_reference
+from instant_ic.vspace.nerf import reference
 from instant_ic.vspace.nerf.field import (
     VOLUME_WEIGHTS,
     FieldParameters,
@@ -24,6 +24,7 @@ from instant_ic.vspace.nerf.field import (
 )
 from instant_ic.vspace.nerf.reference import TorchField, TorchGrid, TorchPrior, TrainState
 from instant_ic.vspace.view import LensRays
+from tests.vspace import volume_reference
 
 RAYS_AT_ONCE = 1 << 18
 

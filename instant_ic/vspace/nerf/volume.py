@@ -1,7 +1,8 @@
 """Geometry as density, as in the paper: compositing of samples around the depth, with its gradient (numba).
 
-The torch functions in ``volume_reference.py`` do the same. Network's output 3 is the logarithm of the density, per band
-of the newest keyframe (``band · distance to its camera`` metres), so that walls near and far look alike to the network.
+The network's output 3 is the logarithm of the density, per band of the newest keyframe (``band · distance to its
+camera`` metres), so that near and far walls look alike to the network. ``tests/vspace/volume_reference.py`` computes
+the same in torch.
 """
 
 from __future__ import annotations
