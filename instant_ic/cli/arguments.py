@@ -38,7 +38,7 @@ def verb(
 
     Args:
         verbs: the subparsers, or the result of :func:`group`.
-        name: on the command line.
+        name: its name on the command line.
         words: its line in the list of commands; also its description where there is no other.
         run: its function, or MODULE.FUNCTION in ``instant_ic.cli``, which is then imported when it runs.
         example: a command line.

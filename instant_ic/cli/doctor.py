@@ -36,9 +36,9 @@ class Finding:
 
     Attributes:
         level: OK, WARN (a function will be missing or slow) or FAIL (the stack will not work).
-        subject: what was checked.
-        text: what was found.
-        advice: what to do about it; empty where all is well.
+        subject: the checked device, file or setting.
+        text: the result.
+        advice: remedy; empty if nothing is wrong.
     """
 
     level: str

@@ -26,7 +26,7 @@ class ParameterInfo:
         value: present value, as plain JSON.
         default: default value, as plain JSON.
         range: allowed range as text; empty without a range.
-        live: whether it can be changed while the node runs.
+        live: true if it can be changed while the node runs.
     """
 
     name: str

@@ -73,7 +73,7 @@ class Value:
         given: value with the spelling of its scalars (``yaml_text.spelled``), or a plain value.
         where: ``config/slam.yaml:12`` or ``-p key:=value``.
         file: the parameter file; None: the command line.
-        shared: whether it comes from a ``/**`` section, which is for every node that has such a parameter.
+        shared: true if it comes from a ``/**`` section, which is for every node that has such a parameter.
     """
 
     given: Any
@@ -420,7 +420,7 @@ def change(
     Args:
         config: the present configuration.
         values: flat or nested keys; unchanged values are allowed.
-        is_live: whether a key may be changed while the node runs.
+        is_live: returns whether a key may be changed while the node runs.
         where: prefix of the error messages.
 
     Raises:

@@ -146,9 +146,9 @@ def require_protection(unprotected: bool, off: Sequence[str], danger: str) -> No
     """Refuse protections that are off unless ``unprotected`` says that this is intended.
 
     Args:
-        unprotected: whether the missing protection is intended.
+        unprotected: true if the missing protection is intended.
         off: names of the parameters that switch a protection off.
-        danger: what may happen.
+        danger: the consequence, for the error.
     """
     if off and not unprotected:
         raise ValueError(

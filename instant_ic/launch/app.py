@@ -38,7 +38,8 @@ def run_stack(
         description: contents of the launch file.
         run_dir: run directory; created if missing, with those of the groups inside.
         live: show a table of the nodes below the lines; default: only if standard output is a terminal.
-        pace: of the stack's time. Default: what the machine can do, if the devices are simulated; else the machine's.
+        pace: the stack's seconds per second of the machine. Default: chosen by the load if the devices are simulated,
+            else 1.
         verbose: show every line of the nodes' output; default: warnings and errors after the start, each once.
 
     Returns:

@@ -48,7 +48,7 @@ class NodeSpec:
         env: environment variables to add.
         respawn: restart it when it ends.
         respawn_delay_s: wait before the first restart; doubles with each further one within the window.
-        required: when it ends, the whole stack ends.
+        required: true if the stack ends with it.
         file: the launch file that contains it.
         line: its line there.
         run_dir: its run directory; None: the stack's own.

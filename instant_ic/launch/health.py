@@ -50,8 +50,8 @@ class TopicFault:
 
     Attributes:
         label: node that publishes it.
-        text: what is wrong, with the numbers.
-        stopped: whether it has stopped.
+        text: the fault, with the numbers.
+        stopped: true if no message arrives any more.
     """
 
     label: str
@@ -218,7 +218,7 @@ class HealthMonitor:
         """Return the addresses of the operator's page and, if it needs a token, of the Foxglove bridge, once they run.
 
         Args:
-            with_token: for a terminal: include the token, which is a new one after a restart; else name its file.
+            with_token: include the token, which changes with each start; for a terminal. Else name its file.
         """
         for spec in self._specs:
             health = self.nodes.get(spec.label)

@@ -54,9 +54,9 @@ class NodeRow:
     """One node.
 
     Attributes:
-        state: in one or two words.
+        state: its state, in one or two words.
         message: its worst diagnosis, else the faults of its topics; empty when all is well.
-        cpu_percent: of one core; nan if unknown.
+        cpu_percent: CPU time, in percent of one core; nan if unknown.
         rss_mb: resident memory; nan if unknown.
         restarts: number of restarts by the launcher.
         lost: messages that it has lost.

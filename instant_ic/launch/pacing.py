@@ -31,7 +31,7 @@ class PaceSample:
         now_s: the machine's steady clock.
         late: largest delay of the simulated devices since the last sample, as a share of the acceptable delay; None: no
             report has arrived since then.
-        stale: whether the arbiter waits for a source that had been fresh.
+        stale: true while the arbiter waits for a source that had been fresh.
         idle_cores: cores that nothing used since the last sample.
         stack_cores: cores that the stack used.
     """

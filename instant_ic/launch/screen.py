@@ -32,12 +32,12 @@ class StackView:
     Attributes:
         rows: its processes, in the order of the launch file.
         missing: nodes that have not reported yet that they run.
-        waiting: what an operator still waits for (camera, map, ...).
+        waiting: steps of the start that are still missing (camera, map, ...).
         addresses: address of each page, by its node's label, once it is available.
         faults: topics that have stopped or are too slow, as text.
-        looked: whether the launcher receives heartbeats already.
-        ending: whether the stack is shutting down, so that nothing is waited for.
-        pace: of the simulation, as text; empty in real time.
+        looked: true once the launcher receives heartbeats.
+        ending: true while the stack shuts down; then nothing is waited for.
+        pace: pace of the simulation, as text; empty in real time.
     """
 
     rows: tuple[NodeRow, ...] = ()
