@@ -11,33 +11,14 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
-from numba import njit
 
 from instant_ic.experiments.slam_logs import LogEntry
 from instant_ic.geometry.poses import compose2, relative2, wrap_angle
+from instant_ic.sim.world import Material, WorldBuilder
 from instant_ic.slam import Scan
 from instant_ic.slam.scan import FloatArray
 
 Wall = tuple[float, float, float, float]
-
-
-@njit(cache=True)
-def cast_rays(walls, x, y, angles):  # type: ignore[no-untyped-def]
-    """Return the distance to the first wall (m, 4: x0 y0 x1 y1) along each angle (n,); inf if there is none."""
-    out = np.full(angles.shape[0], np.inf)
-    for i in range(angles.shape[0]):
-        dx, dy = math.cos(angles[i]), math.sin(angles[i])
-        for k in range(walls.shape[0]):
-            sx, sy = walls[k, 0] - x, walls[k, 1] - y
-            ex, ey = walls[k, 2] - walls[k, 0], walls[k, 3] - walls[k, 1]
-            cross = dx * ey - dy * ex
-            if abs(cross) < 1e-12:
-                continue
-            along_ray = (sx * ey - sy * ex) / cross
-            along_wall = (sx * dy - sy * dx) / cross
-            if 0.0 < along_ray < out[i] and 0.0 <= along_wall <= 1.0:
-                out[i] = along_ray
-    return out
 
 
 @dataclass(frozen=True)
@@ -103,7 +84,10 @@ def drive(
         step_rad: radians between scans.
     """
     rng = np.random.default_rng(seed)
-    world = np.array(walls, dtype=np.float64)
+    builder = WorldBuilder()
+    for x0, y0, x1, y1 in walls:
+        builder.wall((x0, y0), (x1, y1), 0.0, 1.0, Material("white"))
+    caster = builder.build("walls", 1.0, (0.0, 0.0, 0.0)).caster
     poses = _poses_along(np.array(waypoints, dtype=np.float64), step_m, step_rad)
     factor = 1.0 + 0.03 * rng.uniform(-1.0, 1.0, 3)
     odometry = np.zeros(3)
@@ -116,8 +100,10 @@ def drive(
             rng.random()  # keeps the noise of the published figures
             odometry = compose2(odometry, factor * step + 0.05 * size * rng.standard_normal(3))
         at = compose2(pose, mount)
-        ranges = cast_rays(world, at[0], at[1], laser.angles + at[2])
-        ranges = ranges + laser.noise_m * rng.standard_normal(laser.beams)
+        angles = laser.angles + at[2]
+        rays = np.column_stack([np.cos(angles), np.sin(angles), np.zeros(laser.beams)]).astype(np.float32)
+        hits, _ = caster.cast(np.array([at[0], at[1], 0.5], np.float32), rays)
+        ranges = hits.astype(np.float64) + laser.noise_m * rng.standard_normal(laser.beams)
         ranges[ranges >= laser.range_max] = np.inf
         increment = float(laser.angles[1] - laser.angles[0])
         scan = Scan(ranges, float(laser.angles[0]), increment, 0.02, laser.range_max, (index + 1) * 100_000_000)

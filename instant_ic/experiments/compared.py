@@ -49,7 +49,7 @@ def view_units(
         "method": options.method,
         "sources": list(sources),
         "paths": list(paths),
-        "size": list(options.view_size),
+        "size": [96, 54] if options.quick else [320, 180],
         "panorama_width": 512 if options.quick else 2048,
         "seconds": 0.5 if options.quick else 8.0,
         "step_m": 0.5 if options.quick else 0.25,
@@ -171,13 +171,12 @@ def command_of(options: Options, experiment: str) -> str:
     """Return the command that measures a section again."""
     quick = " --quick" if options.quick else f" --seeds {options.seeds}"
     method = "" if options.method == "ours" else f" --method {options.method}"
-    size = "" if options.size is None else f" --size {options.size[0]}x{options.size[1]}"
     where = "".join(f" --world {shlex.quote(world)}" for world in options.worlds)
     if options.bag is not None:
         where = f" --bag {shlex.quote(str(options.bag))}"
     if experiment == "environments":
         where += "".join(f" --meshes {shlex.quote(mesh)}" for mesh in options.meshes)
-    return f"ic experiment {experiment}{where}{quick}{method}{size} -o REPORT"
+    return f"ic experiment {experiment}{where}{quick}{method} -o REPORT"
 
 
 def _table(caption: str, found: Series, command: str) -> Table:

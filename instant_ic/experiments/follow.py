@@ -51,8 +51,6 @@ REACHED_M, REACHED_RAD = 0.20, math.radians(12.0)
 """
 SPARE_M = 0.05
 """A goal is reachable if the footprint with this margin on every side can get there."""
-TURNING_RAD_S = 0.1
-"""Below this yaw rate the robot does not count as turning when changes of direction are counted."""
 OPERATOR_M_S = 0.4
 
 
@@ -68,8 +66,6 @@ class Episode:
     driven_m: float = 0.0
     contacts: int = 0
     """Number of contacts of the robot with a wall or an object."""
-    yaw_rate_changes: int = 0
-    """Sign changes of the yaw rate beyond TURNING_RAD_S on both sides."""
     clearance_m: float = math.inf
     """Smallest distance of the true footprint from any static object."""
     reason: str = ""
@@ -154,17 +150,13 @@ class FollowDrive:
         episode = self.episode
         limit_s = 60.0 + 3.0 * episode.optimum_m / OPERATOR_M_S if episode.reachable else 40.0
         tracks: dict[str, list[FloatArray]] = {"robot": [], "vbot": []}
-        turning, before = 0.0, self.robot.pose.copy()
+        before = self.robot.pose.copy()
         for k in range(round(limit_s / DT_S)):
             episode.seconds = k * DT_S
             self.step(k)
             pose = self.robot.pose
             episode.driven_m += float(np.linalg.norm(pose[:2] - before[:2]))
             before = pose.copy()
-            rate = float(self.robot.twist[2])
-            if abs(rate) > TURNING_RAD_S:
-                episode.yaw_rate_changes += int(turning * rate < 0)
-                turning = rate
             if k % 4 == 0:
                 tracks["robot"].append(pose.copy())
                 tracks["vbot"].append(self.vbot.pose.copy())
@@ -332,7 +324,6 @@ def summary(episodes: list[Episode]) -> dict[str, Any]:
     ratios = np.array([e.ratio for e in reached])
     slowness = np.array([e.seconds * OPERATOR_M_S / e.optimum_m for e in reached])
     metres = sum(e.driven_m for e in episodes)
-    changes = sum(e.yaw_rate_changes for e in episodes)
     contacts = sum(e.contacts for e in episodes)
     share = len(reached) / len(reachable) if reachable else math.nan
     figures: dict[str, Any] = {
@@ -345,7 +336,6 @@ def summary(episodes: list[Episode]) -> dict[str, Any]:
         "path_ratio_mean": _reduced(np.mean, ratios),
         "path_ratio_max": _reduced(np.max, ratios),
         "time_ratio_max": _reduced(np.max, slowness),
-        "yaw_rate_changes_per_m": changes / max(metres, 1e-9),
         "metres": metres,
     }
     for name in ("planner", "controller", "costmap"):

@@ -44,7 +44,6 @@ class Options:
         method: virtual space that is compared, ``ours`` or ``paper``.
         bag: recording to use instead of worlds; None: none.
         quick: small images, two seeds and short training, to check that everything works.
-        size: width and height of the views; None: 320 × 180, quick 96 × 54.
         meshes: mesh files that are environments beside the simulator's own.
     """
 
@@ -53,12 +52,7 @@ class Options:
     method: str = "ours"
     bag: Path | None = None
     quick: bool = False
-    size: tuple[int, int] | None = None
     meshes: tuple[str, ...] = ()
-
-    @property
-    def view_size(self) -> tuple[int, int]:
-        return self.size or ((96, 54) if self.quick else (320, 180))
 
     def cases(self, worlds: Sequence[str] = (WORLD,)) -> list[tuple[str, int]]:
         """Return the world of each unit and the seed of its start; 0 is the world's own start."""

@@ -203,12 +203,12 @@ def test_an_unexpected_error_ends_its_unit_only(tmp_path, monkeypatch) -> None:
 
 
 def test_two_meshes_of_one_name_are_not_averaged_and_each_kind_of_world_shows_images() -> None:
-    options = Options(2, ("a/house.glb", "b/house.glb", "random:7", "random:9"), size=(64, 32))
+    options = Options(2, ("a/house.glb", "b/house.glb", "random:7", "random:9"))
     units = compared.view_units("ablation", options, ("ours",), ())
     shown = [compared.family(Result(unit, {}, 0.0, 0.0)) for unit in units if unit.arguments["images"]]
     assert shown == ["a/house.glb", "b/house.glb", "random"]
     worlds = "--world a/house.glb --world b/house.glb --world random:7 --world random:9"
-    command = f"ic experiment ablation {worlds} --seeds 2 --size 64x32 -o REPORT"
+    command = f"ic experiment ablation {worlds} --seeds 2 -o REPORT"
     assert compared.command_of(options, "ablation") == command
     recording = Options(2, bag=Path("my {drive}"))
     assert compared.command_of(recording, "ablation") == "ic experiment ablation --bag 'my {drive}' --seeds 2 -o REPORT"
@@ -378,8 +378,6 @@ def test_a_recorded_drive_is_shown(tmp_path) -> None:
     ("arguments", "words"),
     [
         (["--seeds", "0"], "--seeds: must be > 0"),
-        (["--size", "big"], "--size: must look like 640x360"),
-        (["--size", "8x640"], "at least 16 pixels"),
         (["--jobs", "0"], "--jobs: must be > 0"),
         (["--timeout", "nan"], "--timeout: must be > 0"),
         (["--timeout", "inf"], "--timeout: must be finite"),
@@ -427,7 +425,7 @@ def test_a_recording_shows_what_later_panoramas_saw(tmp_path) -> None:
             message = keyframe(number, x, box_room.panorama(pose_matrix(x), 128), 7)
             kind = "instant_ic_msgs/msg/Keyframe"
             writer.write("/keyframe", kind, bytes(serialize(message)), 10**9 * (number + 1), LATCHED)
-    options = Options(5, bag=tmp_path / "bag", size=(48, 32))
+    options = Options(5, bag=tmp_path / "bag")
     units = reconstruction.units(options)
     assert [unit.arguments["number"] for unit in units] == [0, 1]
     arguments = {**units[0].arguments, "sources": ["panorama", "depth-warp"], "panorama_width": 256}
@@ -444,7 +442,7 @@ def test_a_recording_shows_what_later_panoramas_saw(tmp_path) -> None:
     place = Result(first, environments.measure({**first.arguments, **given}), 1.0, 1.0)
     lost = environments.losses(place, "ours")
     assert lost["unseen"] is not None and lost["unseen"] >= 0 and lost["depth"] is lost["pose"] is None
-    (trained, _) = training_time.units(Options(5, bag=tmp_path / "bag", quick=True, size=(48, 32)))
+    (trained, _) = training_time.units(Options(5, bag=tmp_path / "bag", quick=True))
     rows = training_time.measure({**trained.arguments, "panorama_width": 256, "times_s": [0.05]})["rows"]
     assert {(row["source"], row["distance_m"]) for row in rows} == {
         (source, at) for source in ("ours", "field", "paper") for at in (0.0, 1.0)

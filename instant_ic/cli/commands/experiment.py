@@ -12,7 +12,7 @@ from collections import Counter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from instant_ic.cli.arguments import positive, positive_int, size, verb
+from instant_ic.cli.arguments import positive, positive_int, verb
 from instant_ic.cli.errors import UserError
 from instant_ic.cli.evaluations import errors_for_the_user, use_one_thread_for_matrices
 from instant_ic.cli.progress import progress
@@ -42,7 +42,6 @@ def add_parser(subparsers: Any) -> None:
     add("--bag", type=Path, help=text)
     add("--meshes", type=Path, metavar="DIR", help="environments: also the meshes of this folder")
     add("--quick", action="store_true", help="two seeds, small images, short training: does everything work?")
-    add("--size", type=_size, metavar="WxH", help="size of the views (default: 320x180)")
     text = "units in parallel (default: %(default)s)"
     add("--jobs", type=positive_int, default=os.cpu_count() or 1, metavar="N", help=text)
     add("--timeout", type=_limit, default=86400.0, metavar="S", help="limit for all units (default: %(default)g s)")
@@ -121,14 +120,7 @@ def _options(args: argparse.Namespace) -> lab.Options:
         meshes = sorted(str(path) for path in args.meshes.glob("*") if path.suffix.lower() in _MESHES)
         if not meshes:
             raise UserError(f"--meshes: {args.meshes} has no mesh ({', '.join(_MESHES)})", 2)
-    return lab.Options(args.seeds, tuple(args.world), args.method, args.bag, args.quick, args.size, tuple(meshes))
-
-
-def _size(text: str) -> tuple[int, int]:
-    width, height = size(text)
-    if min(width, height) < 16:
-        raise argparse.ArgumentTypeError(f"each side must be at least 16 pixels (got {text!r})")
-    return width, height
+    return lab.Options(args.seeds, tuple(args.world), args.method, args.bag, args.quick, tuple(meshes))
 
 
 def _limit(text: str) -> float:
