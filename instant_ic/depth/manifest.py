@@ -11,8 +11,9 @@ import yaml
 
 from instant_ic.config.params import ParameterError, Value, build
 from instant_ic.config.ranges import Positive, Range, check_ranges, require
-from instant_ic.config.yaml_text import compose_yaml, spelled
+from instant_ic.config.yaml_place import YamlProblem, load
 from instant_ic.depth.scaler import OUTPUT_KINDS
+from instant_ic.util import paths
 
 REQUIRED = ("model", "name", "licence", "input_height", "input_width")
 
@@ -93,21 +94,13 @@ def load_manifest(path: str | Path) -> ModelManifest:
         ManifestError: with the file, the line, the key and what it should be.
     """
     path = Path(path)
+    if not paths.is_file(path):
+        raise ManifestError(f"{path}: no manifest. A depth model needs one beside it (docs/depth.md)")
     try:
-        root = compose_yaml(path.read_text(encoding="utf-8"))
-        if not isinstance(root, yaml.MappingNode):
-            raise ManifestError(f"{path}: must be keys and values")
-        values = {
-            str(key.value): Value(spelled(value), f"{path}:{key.start_mark.line + 1}") for key, value in root.value
-        }
-    except FileNotFoundError as error:
-        raise ManifestError(f"{path}: no manifest. A depth model needs one beside it (docs/depth.md)") from error
-    except OSError as error:
-        raise ManifestError(f"{path}: cannot be read: {error.strerror}") from error
-    except ManifestError:
-        raise
-    except (yaml.YAMLError, ValueError) as error:
-        raise ManifestError(f"{path}: not YAML: {error}") from error
+        fields = load(path).fields()
+        values = {key: Value(field.spelled(), f"{path}:{field.line}") for key, field in fields.items()}
+    except YamlProblem as problem:
+        raise ManifestError(f"{path}:{problem.line}: {problem.text}") from problem
     if missing := [key for key in REQUIRED if key not in values]:
         raise ManifestError(f"{path}: missing key {', '.join(missing)}")
     try:
