@@ -1,4 +1,3 @@
-import json
 from pathlib import Path
 
 import numpy as np
@@ -7,12 +6,8 @@ from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import Reader
 
 from instant_ic.bag import BagError, BagReader, BagWriter
-from instant_ic.bag.choice import TopicChoice
-from instant_ic.bag.recorder import Recorder
 from instant_ic.bag.recover import recover
-from instant_ic.bus import LATCHED, RELIABLE, SENSOR
-from instant_ic.bus.qos import QoS
-from instant_ic.bus.registry import PublisherInfo, TopicInfo
+from instant_ic.bus import LATCHED, SENSOR
 from instant_ic.msg import (
     Bool,
     Keyframe,
@@ -111,55 +106,3 @@ def test_type_hash_is_that_of_ros(tmp_path: Path) -> None:
 def test_what_cannot_be_done_is_told(tmp_path: Path, action: object, message: str) -> None:
     with pytest.raises(BagError, match=message):
         action(tmp_path)  # type: ignore[operator]
-
-
-class Losses:
-    def __init__(self) -> None:
-        self.lost_by: dict[str, int] = {}
-
-
-def topic_info(topic: str, type_name: str, *presets: QoS) -> TopicInfo:
-    publishers = [PublisherInfo(f"n{i}", 1, qos.name, Path("s"), type_name, "00", 0) for i, qos in enumerate(presets)]
-    return TopicInfo(topic, type_name, publishers)
-
-
-def test_recorder_files_old_latched_values_under_the_beginning(tmp_path: Path) -> None:
-    counters: dict[str, Losses] = {}
-
-    def subscribe(topic: str, callback: object) -> Losses:
-        return counters.setdefault(topic, Losses())
-
-    recorder = Recorder(tmp_path / "bag", TopicChoice(exclude=("/heart*",)), subscribe)
-    recorder.discover([topic_info("/estop", BOOL, SENSOR, LATCHED), topic_info("/heartbeat", BOOL, RELIABLE)])
-    recorder.discover([topic_info("/estop", BOOL, LATCHED), topic_info("/scan", SCAN, SENSOR)])
-    assert list(counters) == ["/estop", "/scan"]
-    recorder.take("/estop", BOOL, b"old", 5)  # minutes before the recording
-    recorder.take("/scan", SCAN, b"first", 1000)
-    recorder.take("/scan", SCAN, b"second", 1100)
-    recorder.take("/scan", SCAN, b"no clock yet", 0)
-    counters["/scan"].lost_by = {"front": 4}
-    recorder.close()
-    with BagReader(tmp_path / "bag") as reader:
-        assert [(m.topic, m.stamp_ns, m.payload) for m in reader.messages()] == [
-            ("/estop", 1000, b"old"),
-            ("/scan", 1000, b"first"),
-            ("/scan", 1100, b"second"),
-        ]
-        assert {t.topic: t.qos.name for t in reader.topics} == {"/estop": "latched", "/scan": "sensor"}
-        assert json.loads(reader.custom["instant_ic.lost_by"]) == {"/scan": {"front": 4}}
-
-
-def test_recorder_on_simulated_time_gives_foreign_stamps_its_own(tmp_path: Path) -> None:
-    now_ns = [0]
-    recorder = Recorder(tmp_path / "bag", TopicChoice(), lambda topic, callback: Losses(), lambda: now_ns[0])
-    recorder.discover([topic_info("/scan", SCAN, SENSOR)])
-    recorder.take("/scan", SCAN, b"early", 0)
-    now_ns[0] = 50_000_000_000
-    recorder.take("/scan", SCAN, b"follows the clock", 49_900_000_000)
-    recorder.take("/scan", SCAN, b"wall time", 1_700_000_000_000_000_000)
-    recorder.close()
-    with BagReader(tmp_path / "bag") as reader:
-        assert [(m.stamp_ns, m.payload) for m in reader.messages()] == [
-            (49_900_000_000, b"follows the clock"),
-            (50_000_000_000, b"wall time"),
-        ]

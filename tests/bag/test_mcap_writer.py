@@ -25,7 +25,7 @@ def fill(file: McapWriter, sizes: list[int]) -> list[tuple[int, bytes]]:
 
 
 @pytest.mark.parametrize("compressed", [False, True])
-@pytest.mark.parametrize("sizes", [[0, 1, 5, 300], [CHUNK_BYTES, CHUNK_BYTES - 100, 7], [3_000_000] * 3])
+@pytest.mark.parametrize("sizes", [[0, 1, CHUNK_BYTES, 7], [3_000_000] * 3])
 def test_mcap_package_reads_it_with_check_sums(tmp_path: Path, sizes: list[int], compressed: bool) -> None:
     file = McapWriter(tmp_path / "a.mcap", TOPICS, compressed)
     sent = fill(file, sizes)

@@ -19,7 +19,7 @@ from instant_ic.bag.mcap_scan import McapScan
 from instant_ic.bag.recorder import BagRecorderConfig, Recorder
 from instant_ic.bag.recording import DISK_FULL, ENDED, FAILED, RECORDING, Recording
 from instant_ic.bag.snapshot import SnapshotCache
-from instant_ic.bus import LATCHED, SENSOR
+from instant_ic.bus import LATCHED, RELIABLE, SENSOR
 from instant_ic.bus.qos import QoS
 from instant_ic.bus.registry import PublisherInfo, TopicInfo
 from instant_ic.msg import Bool, serialize
@@ -175,6 +175,38 @@ def test_folder_taken_away_is_told(tmp_path: Path) -> None:
     assert "its folder was removed" in bag.error
     with pytest.raises(BagError, match="was removed"):
         recorder.close()
+
+
+def test_old_latched_values_are_filed_under_the_beginning(tmp_path: Path) -> None:
+    subscribed: list[str] = []
+
+    def subscribe(topic: str, callback: object) -> Any:
+        subscribed.append(topic)
+        return Losses()
+
+    recorder = Recorder(tmp_path / "bag", TopicChoice(exclude=("/heart*",)), subscribe)
+    recorder.discover([topic_info("/estop", SENSOR, LATCHED), topic_info("/heartbeat", RELIABLE)])
+    recorder.discover([topic_info("/estop", LATCHED), topic_info("/scan", SENSOR)])
+    assert subscribed == ["/estop", "/scan"]
+    recorder.take("/estop", BOOL, b"old", 5)  # minutes before the recording
+    recorder.take("/scan", BOOL, b"first", 1000)
+    recorder.take("/scan", BOOL, b"second", 1100)
+    recorder.take("/scan", BOOL, b"no clock yet", 0)
+    recorder.close()
+    assert read(tmp_path / "bag") == [("/estop", 1000, b"old"), ("/scan", 1000, b"first"), ("/scan", 1100, b"second")]
+    with BagReader(tmp_path / "bag") as reader:
+        assert {t.topic: t.qos.name for t in reader.topics} == {"/estop": "latched", "/scan": "sensor"}
+
+
+def test_on_simulated_time_foreign_stamps_get_the_time_of_arrival(tmp_path: Path) -> None:
+    now_ns = [0]
+    recorder = Recorder(tmp_path / "bag", TopicChoice(), lambda topic, take: Losses(), lambda: now_ns[0])  # type: ignore[arg-type, return-value]
+    recorder.take("/scan", BOOL, b"early", 0)
+    now_ns[0] = 50 * S
+    recorder.take("/scan", BOOL, b"follows the clock", 49 * S)
+    recorder.take("/scan", BOOL, b"wall time", 1_700_000_000 * S)
+    recorder.close()
+    assert read(tmp_path / "bag") == [("/scan", 49 * S, b"follows the clock"), ("/scan", 50 * S, b"wall time")]
 
 
 def test_losses_are_a_warning_only_while_they_grow(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
