@@ -284,6 +284,11 @@ def test_another_definition_of_a_type_is_told_and_kept_out(world):
 # -- commands ----------------------------------------------------------------------------------------
 
 
+def stop_publisher(node):
+    kind = "std_msgs/msg/Bool"
+    return RosPublisher(node, "/robot1/operator/estop", kind, type_hash(kind), LATCHED)
+
+
 @pytest.fixture
 def operator(world):
     """A robot that takes commands, and somebody outside who sends them with times and senders as told."""
@@ -292,7 +297,7 @@ def operator(world):
     driven, stops = listener.listen("/operator/cmd_vel", SENSOR), listener.listen("/operator/estop", LATCHED)
     outside = RosNode(world.session(), "/robot1", "station")
     drive = RosPublisher(outside, "/robot1/operator/cmd_vel", TWIST, type_hash(TWIST))
-    stop = RosPublisher(outside, "/robot1/operator/estop", "std_msgs/msg/Bool", type_hash("std_msgs/msg/Bool"), LATCHED)
+    stop = stop_publisher(outside)
 
     def command(v, w=0.0, age_s=0.0):
         drive.put(cdr(twist_stamped(v, w, time.time_ns())), time.time_ns() - int(age_s * 1e9))
@@ -365,15 +370,9 @@ def test_a_stop_comes_in_however_old_it_is_and_only_a_fresh_release_does(operato
     listener.wait(release, "the fresh release")
 
 
-def stop_publisher(world, node):
-    node = RosNode(world.session(), "/robot1", node)
-    kind = "std_msgs/msg/Bool"
-    return RosPublisher(node, "/robot1/operator/estop", kind, type_hash(kind), LATCHED)
-
-
 def test_nobody_but_the_driver_releases_the_emergency_stop_and_everybody_presses_it(operator, world):
     gateway, listener, _, stops, command, stop, _ = operator
-    stranger = stop_publisher(world, "stranger")
+    stranger = stop_publisher(RosNode(world.session(), "/robot1", "stranger"))
 
     def stopped():
         return bool(stops) and deserialize(stops[-1].payload, "std_msgs/msg/Bool").data
@@ -406,8 +405,9 @@ def test_without_tls_no_command_comes_in_but_the_pressing_of_the_emergency_stop(
     assert gateway.node.diagnoses()["commands"][0] == 2
     listener = world.neighbour("robot", "listener")
     driven, stops = listener.listen("/operator/cmd_vel", SENSOR), listener.listen("/operator/estop", LATCHED)
-    stop = stop_publisher(world, "stranger")
-    drive = RosPublisher(stop_node(world), "/robot1/operator/cmd_vel", TWIST, type_hash(TWIST))
+    stranger = RosNode(world.session(), "/robot1", "stranger")
+    stop = stop_publisher(stranger)
+    drive = RosPublisher(stranger, "/robot1/operator/cmd_vel", TWIST, type_hash(TWIST))
 
     def press():
         drive.put(cdr(twist_stamped(0.3, 0.0, time.time_ns())), time.time_ns())
@@ -420,10 +420,6 @@ def test_without_tls_no_command_comes_in_but_the_pressing_of_the_emergency_stop(
     listener.spin(0.2)
     assert driven == [] and "/operator/cmd_vel" not in world.topics("robot")
     assert deserialize(stops[-1].payload, "std_msgs/msg/Bool").data
-
-
-def stop_node(world):
-    return RosNode(world.session(), "/robot1", "driver")
 
 
 def test_names_that_others_make_are_limited(world, monkeypatch):

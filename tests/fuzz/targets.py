@@ -501,7 +501,8 @@ def _zenoh() -> Target:
             except FormatError:
                 continue
 
-    return Target([Attachment(5, 6, bytes(16)).pack()], parse)
+    token = b"@ros2_lv/0/ab/0/1/MP/%/%/n/%t/std_msgs::msg::dds_::String_/RIHS01_0/::,10:,:,:,,"
+    return Target([Attachment(5, 6, bytes(16)).pack(), token], parse)
 
 
 # -- bags --------------------------------------------------------------------------------------------------------------
