@@ -37,14 +37,14 @@ from instant_ic.geometry.image_quality import psnr_db, ssim
 from instant_ic.geometry.poses import pose_matrix
 from instant_ic.sim.render import EquirectRenderer
 from instant_ic.sim.worlds import make_world
-from instant_ic.vspace import FieldConfig, PictureConfig, TrainConfig, VirtualSpace, VirtualSpaceConfig
+from instant_ic.vspace import FieldConfig, TrainConfig, ViewContentConfig, VirtualSpace, VirtualSpaceConfig
 
 FOV = math.pi / 2
 PANORAMA = 1024
 """Width of the keyframes' panoramas in pixels."""
 SIZES = ((320, 180), (640, 360), (1280, 720))
 """Sizes of the timed views, width and height in pixels."""
-FIELD_ONLY = PictureConfig(field_alone=True)
+FIELD_ONLY = ViewContentConfig(field_alone=True)
 KEYFRAMES = {"one": (0.0,), "three": (-1.5, -0.75, 0.0), "three, one ahead": (-1.5, 3.0, 0.0)}
 """Places of the keyframes along x in metres, in order of arrival."""
 DEPTH_ERRORS = (0.0, 0.04)
@@ -132,7 +132,7 @@ def train(run: GpuRun) -> dict[str, Any]:
         poses = [pose_matrix(), pose_matrix(1.0), pose_matrix(0.5, 0.4, yaw=0.35)]
         truth, keyframe = [place.truth(pose) for pose in poses], place.keyframe(0.0)
         for device in run.devices:
-            space = VirtualSpace(run.config(device, picture=FIELD_ONLY))
+            space = VirtualSpace(run.config(device, view=FIELD_ONLY))
             space.set_keyframe(*keyframe)
             space.train(iterations=3)  # compiles
             space.set_keyframe(*keyframe)
@@ -161,9 +161,9 @@ def views(run: GpuRun) -> dict[str, Any]:
     first_keyframe, keyframe = place.keyframe(-0.3), place.keyframe(0.0)
     pose = place.start @ pose_matrix(1.0, 0.1, yaw=0.1)
     for device in run.devices:
-        for name, picture in (("field", FIELD_ONLY), ("as shown", PictureConfig())):
+        for name, content in (("field", FIELD_ONLY), ("as shown", ViewContentConfig())):
             start = run.clock()
-            space = VirtualSpace(run.config(device, picture=picture))
+            space = VirtualSpace(run.config(device, view=content))
             found: dict[str, Any] = {"device": space.status.device, "start_s": round(run.clock() - start, 2)}
             space.set_keyframe(*first_keyframe)
             space.train(iterations=3)
@@ -200,7 +200,7 @@ def _views_per_second(run: GpuRun, space: VirtualSpace, pose: Any, size: tuple[i
 def field_or_warp(run: GpuRun) -> dict[str, Any]:
     """Compare left-out views of the warp of all keyframes and of fields trained on them."""
     result: dict[str, Any] = {}
-    alone = run.config(run.devices[0], keyframes=4, picture=FIELD_ONLY)
+    alone = run.config(run.devices[0], keyframes=4, view=FIELD_ONLY)
     density = FieldConfig(geometry="density")
     sources = {
         "warp": dataclasses.replace(alone, source="warp"),

@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 import pytest
 
-from instant_ic.depth.files import DepthFileError, load_depth, load_picture
+from instant_ic.depth.files import DepthFileError, load_depth, load_rgb
 from instant_ic.experiments.slam_logs import LogError, read_log
 from instant_ic.geometry.mesh_file import MeshError, load_mesh
 from instant_ic.slam.map_files import MapError, load_grid
@@ -56,7 +56,7 @@ def test_image_file_is_refused_by_its_declared_size(tmp_path: Path) -> None:
     with pytest.raises(DepthFileError):
         load_depth(path)
     with pytest.raises(DepthFileError):
-        load_picture(path)
+        load_rgb(path)
     (tmp_path / "map.yaml").write_text("image: bomb.png\nresolution: 0.05\norigin: [0, 0, 0]\n")
     with pytest.raises(MapError):
         load_grid(tmp_path / "map.yaml")

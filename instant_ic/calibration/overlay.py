@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from instant_ic.calibration.mount import CalibrationFrame
-from instant_ic.depth.colour import depth_picture
+from instant_ic.depth.colour import coloured_depth
 from instant_ic.depth.visibility import hidden, nearest_points
 from instant_ic.geometry.poses import Matrix, transform_points
 
@@ -19,7 +19,7 @@ def overlay(frame: CalibrationFrame, camera_from_lidar: Matrix, width: int = 160
     picture = cv2.cvtColor(cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY), cv2.COLOR_GRAY2RGB) // 3 * 2
     points = transform_points(camera_from_lidar, np.asarray(frame.points, np.float64))
     rows, columns, range_m = nearest_points(points[~hidden(points)], width, width // 2)
-    colours = depth_picture(range_m[None], near=0.5, far=12.0)[0]
+    colours = coloured_depth(range_m[None], near=0.5, far=12.0)[0]
     for shift in (0, 1):
         picture[np.minimum(rows + shift, width // 2 - 1), columns] = colours
     return np.asarray(picture, np.uint8)

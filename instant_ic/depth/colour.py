@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 
-def depth_picture(
+def coloured_depth(
     depth: NDArray[np.floating], near: float | None = None, far: float | None = None
 ) -> NDArray[np.uint8]:
     """Colour depth (H, W) on a logarithmic scale, near bright, far dark, unknown black; return RGB, (H, W, 3).

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from instant_ic.util.limits import check_arrays, load_image
 
 DEPTH_SUFFIXES = (".png", ".npy", ".npz")
-PICTURE_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp")
+IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp")
 _BEYOND_M = 1e4
 """Renderers write such values (inf, 1e10) where a ray meets nothing."""
 
@@ -24,7 +24,7 @@ class DepthFileError(ValueError):
     """A file holds no depth or no image; the message names the file and the reason."""
 
 
-def load_picture(path: str | Path) -> NDArray[np.uint8]:
+def load_rgb(path: str | Path) -> NDArray[np.uint8]:
     """Load an image as (H, W, 3) uint8 RGB.
 
     Raises:
@@ -35,7 +35,7 @@ def load_picture(path: str | Path) -> NDArray[np.uint8]:
     _check_readable(path)
     picture = load_image(path, cv2.IMREAD_COLOR)
     if picture is None:
-        raise DepthFileError(f"{path}: not a readable image ({', '.join(s[1:] for s in PICTURE_SUFFIXES)})")
+        raise DepthFileError(f"{path}: not a readable image ({', '.join(s[1:] for s in IMAGE_SUFFIXES)})")
     return np.ascontiguousarray(picture[..., ::-1], np.uint8)
 
 

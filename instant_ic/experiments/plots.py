@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from instant_ic.depth.colour import depth_picture
+from instant_ic.depth.colour import coloured_depth
 from instant_ic.geometry.projections import perspective_directions, sample_equirect
 from instant_ic.slam.occupancy import OccupancyGrid
 
@@ -42,10 +42,10 @@ def save_depth_sheet(path: Path, rows: Sequence[Scored]) -> None:
         near, far = np.percentile(known, (1, 99)) if len(known) else (1.0, 2.0)
         line[0].imshow(row.rgb)
         line[0].set_title(row.name, fontsize=9)
-        line[1].imshow(depth_picture(row.depth_m, near, far))
+        line[1].imshow(coloured_depth(row.depth_m, near, far))
         line[1].set_title(f"depth, {near:.1f} (red) to {far:.1f} m", fontsize=9)
         if row.truth_m is not None and row.after is not None:
-            line[2].imshow(depth_picture(row.truth_m, near, far))
+            line[2].imshow(coloured_depth(row.truth_m, near, far))
             line[2].set_title("truth", fontsize=9)
             size = row.depth_m.shape[1], row.depth_m.shape[0]
             truth = cv2.resize(row.truth_m, size, interpolation=cv2.INTER_NEAREST)

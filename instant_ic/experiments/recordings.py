@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from instant_ic.bus import LATCHED, RELIABLE, SENSOR
-from instant_ic.depth.colour import depth_picture
+from instant_ic.depth.colour import coloured_depth
 from instant_ic.experiments.plots import image_strip, perspective_crop, save_map
 from instant_ic.experiments.stack import Stack, StackError, free_ports
 from instant_ic.geometry.image_quality import psnr_db
@@ -192,7 +192,7 @@ def _results(run: _Run, out: Path) -> dict[str, Any]:
     cv2.imwrite(str(out / "view.png"), strip[..., ::-1])
     depth_m = np.asarray(image_array(keyframe.depth), np.float32)
     near_m, far_m = np.percentile(depth_m[depth_m > 0], (1, 99))
-    colours = depth_picture(depth_m, near_m, far_m)
+    colours = coloured_depth(depth_m, near_m, far_m)
     small = cv2.resize(photo, colours.shape[1::-1], interpolation=cv2.INTER_AREA)
     cv2.imwrite(str(out / "depth.png"), np.vstack([small, colours])[..., ::-1])
     grid, resolution, origin = grid_array(run.maps[-1])

@@ -233,7 +233,7 @@ def train(space: Any, cpu_seconds: float) -> None:
 
 def field_alone(config: VirtualSpaceConfig) -> VirtualSpaceConfig:
     """Return the configuration changed so that the field is shown however little it is trained."""
-    return replace(config, source="field", picture=replace(config.picture, field_alone=True))
+    return replace(config, source="field", view=replace(config.view, field_alone=True))
 
 
 def paper_config(config: VirtualSpaceConfig) -> VirtualSpaceConfig:

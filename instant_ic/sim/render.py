@@ -133,7 +133,7 @@ class EquirectRenderer:
             height: rows of the image; usually half as many.
             supersample: render at this multiple of the size and area-average; depth is taken at the centre instead.
         """
-        return self._picture(np.asarray(map_from_camera), _Lens(width, height), supersample)
+        return self._image(np.asarray(map_from_camera), _Lens(width, height), supersample)
 
     def render_perspective(
         self, map_from_camera: FloatArray, width: int, height: int, hfov_rad: float, supersample: int = 1
@@ -141,7 +141,7 @@ class EquirectRenderer:
         """Render a perspective image along the camera's x with square pixels; depth is radial too."""
         if not 0 < hfov_rad < math.pi:
             raise ValueError(f"hfov_rad must be between 0 and pi (got {hfov_rad})")
-        return self._picture(np.asarray(map_from_camera), _Lens(width, height, hfov_rad), supersample)
+        return self._image(np.asarray(map_from_camera), _Lens(width, height, hfov_rad), supersample)
 
     def cast(
         self, origins: FloatArray, directions: FloatArray
@@ -149,7 +149,7 @@ class EquirectRenderer:
         """Return the ranges (N,) in metres (inf = no hit) and faces (N,) (-1 = no hit) of rays in the world's frame."""
         return self._caster.cast(origins, directions)
 
-    def _picture(self, map_from_camera: FloatArray, lens: _Lens, supersample: int) -> RenderedFrame:
+    def _image(self, map_from_camera: FloatArray, lens: _Lens, supersample: int) -> RenderedFrame:
         if supersample < 1:
             raise ValueError(f"supersample must be at least 1 (got {supersample})")
         if supersample == 1:

@@ -61,10 +61,10 @@ class SimThetaConfig:
 
 
 #: Returns the camera's current view for a width and height: panorama (H, W, 3), sRGB, without the sensor's noise.
-PictureSource = Callable[[int, int], npt.NDArray[np.uint8]]
+ImageSource = Callable[[int, int], npt.NDArray[np.uint8]]
 
 
-def panorama_file(path: str | Path) -> PictureSource:
+def panorama_file(path: str | Path) -> ImageSource:
     """Return a source that always gives one panorama file, area-averaged to the requested size.
 
     Raises:
@@ -102,7 +102,7 @@ class ThetaServer:
         late_s: recent delay of the images behind their plan, in the stack's seconds; 0 without a viewer.
     """
 
-    def __init__(self, config: SimThetaConfig, source: PictureSource, seed: int = 0) -> None:
+    def __init__(self, config: SimThetaConfig, source: ImageSource, seed: int = 0) -> None:
         self.config = config
         self._rng = np.random.default_rng([67, seed])
         self._noise: npt.NDArray[np.int8] = np.empty((0, 0, 3), np.int8)

@@ -4,9 +4,9 @@ from instant_ic.geometry.mesh_file import MeshError
 from instant_ic.vspace.config import (
     FieldConfig,
     GeometryConfig,
-    PictureConfig,
     ReadinessConfig,
     TrainConfig,
+    ViewContentConfig,
     VirtualSpaceConfig,
 )
 from instant_ic.vspace.mesh_space import MeshSpace, Space, make_space
@@ -24,7 +24,6 @@ __all__ = [
     "MeshSpace",
     "NotReadyError",
     "PanoramaWarp",
-    "PictureConfig",
     "ReadinessConfig",
     "Space",
     "SpaceFileError",
@@ -32,6 +31,7 @@ __all__ = [
     "SpaceStatus",
     "TrainConfig",
     "View",
+    "ViewContentConfig",
     "VirtualSpace",
     "VirtualSpaceConfig",
     "make_space",

@@ -94,19 +94,19 @@ class ReadinessConfig(Checked):
 
 
 @dataclass(frozen=True)
-class PictureConfig(Checked):
+class ViewContentConfig(Checked):
     """Content of a view: the keyframe's panorama warped by its depth, or the field where it is measured to be better.
 
     Attributes:
         field_gain_db: dB by which the field must render older keyframes better than the warp to be shown; it then stays
             until it is worse.
         field_alone: the field from its first step on, never the warp, unmeasured: for experiments.
-        refresh_pictures: number of views over which a new keyframe is blended in; 1: at once.
+        refresh_views: number of views over which a new keyframe is blended in; 1: at once.
     """
 
     field_gain_db: Annotated[float, Range(0, 20)] = 0.5
     field_alone: bool = False
-    refresh_pictures: Annotated[int, Range(1, 60)] = 6
+    refresh_views: Annotated[int, Range(1, 60)] = 6
 
 
 @dataclass(frozen=True)
@@ -125,7 +125,7 @@ class VirtualSpaceConfig:
         keyframes: newest keyframes that the field is trained on together, 1..8.
         older: older keyframes, from up to 3 m away, whose pixels show what is hidden from the newest; costs nothing per
             view.
-        picture: the keyframe's panorama warped by its depth, or the field.
+        view: the keyframe's panorama warped by its depth, or the field.
     """
 
     source: str = "field"
@@ -141,7 +141,7 @@ class VirtualSpaceConfig:
     train: TrainConfig = dataclasses.field(default_factory=TrainConfig)
     geometry: GeometryConfig = dataclasses.field(default_factory=GeometryConfig)
     readiness: ReadinessConfig = dataclasses.field(default_factory=ReadinessConfig)
-    picture: PictureConfig = dataclasses.field(default_factory=PictureConfig)
+    view: ViewContentConfig = dataclasses.field(default_factory=ViewContentConfig)
 
     def __post_init__(self) -> None:
         check_ranges(self)

@@ -171,7 +171,7 @@ class VirtualSpace(RayRenderer):
         self._views = 0  # rendered since then
         self.scene: TrainingScene | None = None
         self.trials: tuple[WarpTrial, ...] = ()
-        self.choice = Choice(self.config.picture.field_gain_db)
+        self.choice = Choice(self.config.view.field_gain_db)
         self._ready = False
         self._rng = np.random.default_rng(self.config.train.seed)
         self._run = TrainingRun(self.config, refresh=False)
@@ -249,7 +249,7 @@ class VirtualSpace(RayRenderer):
 
         Args:
             prepared: keyframes of ``prepare``.
-            dissolve: what was shown before dissolves into them over the next ``picture.refresh_pictures`` views.
+            dissolve: what was shown before dissolves into them over the next ``view.refresh_views`` views.
         """
         self._before, self._views = self._shown if dissolve else None, 0
         self._shown = prepared
@@ -258,7 +258,7 @@ class VirtualSpace(RayRenderer):
         self._end_dissolve()
 
     def _end_dissolve(self) -> None:
-        if self._views >= self.config.picture.refresh_pictures - 1:
+        if self._views >= self.config.view.refresh_views - 1:
             self._before = None
 
     def learn(self, shown: KeyframeSet) -> None:
@@ -272,7 +272,7 @@ class VirtualSpace(RayRenderer):
             lattice = old.lattice
         occupancy = build_occupancy(priors, self.config.geometry)
         self._learn(TrainingScene(priors, lattice, occupancy, shown.gains))
-        self.trials = () if self.config.picture.field_alone else trials(shown)
+        self.trials = () if self.config.view.field_alone else trials(shown)
         self._choose()
 
     def _learn(self, scene: TrainingScene) -> None:
@@ -282,7 +282,7 @@ class VirtualSpace(RayRenderer):
         parameters = FieldParameters.random(self.config.field, self.config.train.seed) if anew else None
         self._on_device(lambda device: device.set_scene(scene, parameters))
         self.scene, self.trials = scene, ()
-        self._ready = self._ready and (refresh or not self.config.picture.field_alone)
+        self._ready = self._ready and (refresh or not self.config.view.field_alone)
         self._run = TrainingRun(self.config, refresh, self._run.colour_error if refresh else math.nan)
         self.choice.gain_db = math.nan  # on other images
 
@@ -371,7 +371,7 @@ class VirtualSpace(RayRenderer):
         image = filled_image(view, rays.shape, around)
         if self._before is not None:
             before = filled_image(self._composed(rays, self._before, around), rays.shape, around)
-            image = dissolve(before, image, (self._views + 1) / self.config.picture.refresh_pictures)
+            image = dissolve(before, image, (self._views + 1) / self.config.view.refresh_views)
             self._views += 1
             self._end_dissolve()
         depth, confidence = view.depth.reshape(rays.shape), view.confidence.reshape(rays.shape)
@@ -413,7 +413,7 @@ class VirtualSpace(RayRenderer):
         """Weight of the panorama's colours: 1 while the panorama is shown, 0 while the field is."""
         if self.config.source == "warp":
             return 1.0
-        return 0.0 if self.config.picture.field_alone or self.choice.field else 1.0
+        return 0.0 if self.config.view.field_alone or self.choice.field else 1.0
 
     def parameters(self) -> FieldParameters:
         """Return a copy of the field's present parameters."""

@@ -40,5 +40,5 @@ def warm_up(config: VirtualSpaceConfig | None = None) -> None:
     if space.config.source == "field":
         space.train(iterations=1)
         space.render_equirect(np.eye(4), 64)
-        space.config = dataclasses.replace(space.config, picture=dataclasses.replace(config.picture, field_alone=True))
+        space.config = dataclasses.replace(space.config, view=dataclasses.replace(config.view, field_alone=True))
         space.render(aside, 32, 16, math.pi / 2)

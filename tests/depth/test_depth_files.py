@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from instant_ic.depth.files import DepthFileError, load_depth, load_picture
+from instant_ic.depth.files import DepthFileError, load_depth, load_rgb
 
 DEPTH = np.linspace(0.5, 9.5, 8 * 16, dtype=np.float32).reshape(8, 16)
 DEPTH[2, 3] = 0
@@ -77,8 +77,8 @@ def test_pictures_come_as_rgb_or_with_the_fault(tmp_path):
     picture = np.zeros((4, 8, 3), np.uint8)
     picture[..., 0] = 200  # red
     cv2.imwrite(str(tmp_path / "red.png"), picture[..., ::-1])
-    assert np.array_equal(load_picture(tmp_path / "red.png"), picture)
+    assert np.array_equal(load_rgb(tmp_path / "red.png"), picture)
     (tmp_path / "junk.jpg").write_bytes(b"\xff\xd8 no")
     for name, words in (("junk.jpg", "not a readable image"), ("none.jpg", "No such file")):
         with pytest.raises(DepthFileError, match=words):
-            load_picture(tmp_path / name)
+            load_rgb(tmp_path / name)

@@ -14,7 +14,7 @@ import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from instant_ic.depth.colour import depth_picture
+from instant_ic.depth.colour import coloured_depth
 from instant_ic.depth.manifest import (
     ManifestError,
     ModelManifest,
@@ -156,13 +156,13 @@ def test_model_that_does_not_fit_its_manifest(plain: Path, tmp_path: Path) -> No
         DepthModel.load(path)
 
 
-def test_depth_picture_marks_unknown_black() -> None:
+def test_coloured_depth_marks_unknown_black() -> None:
     depth = np.array([[1.0, 2.0, 4.0, 0.0]], np.float32)
-    coloured = depth_picture(depth, near=1.0, far=4.0)
+    coloured = coloured_depth(depth, near=1.0, far=4.0)
     assert coloured[0, 3].tolist() == [0, 0, 0]
     expected = cv2.applyColorMap(np.array([[255, 127, 0]], np.uint8), cv2.COLORMAP_TURBO)[..., ::-1]
     np.testing.assert_array_equal(coloured[0, :3], expected[0])
-    assert not depth_picture(np.zeros((2, 2))).any()
+    assert not coloured_depth(np.zeros((2, 2))).any()
 
 
 def test_shipped_model_is_what_its_manifest_and_record_say() -> None:

@@ -12,8 +12,8 @@ from instant_ic.geometry.poses import pose_matrix
 from instant_ic.vspace import (
     FieldConfig,
     KeyframeError,
-    PictureConfig,
     TrainConfig,
+    ViewContentConfig,
     VirtualSpace,
     VirtualSpaceConfig,
 )
@@ -117,7 +117,7 @@ def chain(depths, sigma, step_m, robot=None):
         return
     pose = space.keyframe.map_from_camera @ pose_matrix(0.4, 0.1, 0.0, yaw=0.2)
     views = [space.render(pose, 24, 16, 1.5), space.render_equirect(pose, 32)]
-    space.config = dataclasses.replace(CONFIG, picture=PictureConfig(field_alone=True))
+    space.config = dataclasses.replace(CONFIG, view=ViewContentConfig(field_alone=True))
     for view in (*views, space.render(pose, 24, 16, 1.5)):
         assert view.rgb.shape[2] == 3
         assert np.isfinite(view.depth_m).all() and view.depth_m.min() >= 0

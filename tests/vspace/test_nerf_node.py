@@ -130,10 +130,10 @@ def test_a_view_is_rendered_again_only_when_it_would_differ():
         assert renders(request_message(4, pose=CAMERA @ pose_matrix(y=0.004))) == 1
         assert renders(request_message(5, pose=CAMERA @ pose_matrix(y=0.004), fov=1.4)) == 1
         bus.publish("/keyframe", keyframe_message(number=5), latched=True)
-        numbers = range(6, 6 + SPACE.picture.refresh_pictures + 2)
+        numbers = range(6, 6 + SPACE.view.refresh_views + 2)
         # Rendered until the keyframe before has dissolved into the new one, once more, and then no more.
         counts = [renders(request_message(number, pose=beside)) for number in numbers]
-        assert counts == [1] * SPACE.picture.refresh_pictures + [0, 0], counts
+        assert counts == [1] * SPACE.view.refresh_views + [0, 0], counts
 
 
 @pytest.mark.parametrize(

@@ -11,10 +11,10 @@ from instant_ic.vspace import (
     FieldConfig,
     KeyframeError,
     NotReadyError,
-    PictureConfig,
     ReadinessConfig,
     SpaceState,
     TrainConfig,
+    ViewContentConfig,
     VirtualSpace,
     VirtualSpaceConfig,
 )
@@ -30,7 +30,7 @@ CONFIG = VirtualSpaceConfig(
     field=FieldConfig(log2_table=14),
     train=TrainConfig(ray_columns=64, ray_rows=32, iterations=120),
 )
-FIELD_ONLY = dataclasses.replace(CONFIG, picture=PictureConfig(field_alone=True))
+FIELD_ONLY = dataclasses.replace(CONFIG, view=ViewContentConfig(field_alone=True))
 CAMERA = pose_matrix(x=0.4, y=0.1, z=0.05, yaw=-0.5)
 
 
@@ -105,7 +105,7 @@ def test_a_space_that_is_fit_stays_so_and_the_next_keyframe_is_shown_at_once():
 
 
 def test_what_is_shown_passes_into_a_new_keyframe():
-    space = VirtualSpace(dataclasses.replace(CONFIG, picture=PictureConfig(refresh_pictures=4)))
+    space = VirtualSpace(dataclasses.replace(CONFIG, view=ViewContentConfig(refresh_views=4)))
     old, new = (box_room.panorama(pose, 96) for pose in (CAMERA, NEXT))
     space.set_keyframe(old.rgb, old.depth_m, CAMERA, 0.02)
     first = space.render(CAMERA, 64, 36, 1.5).rgb.astype(float)
@@ -202,7 +202,7 @@ def once(call):
 def test_a_gpu_without_memory_is_left_for_the_cpu_with_what_is_learnt(call, monkeypatch):
     monkeypatch.setattr("instant_ic.vspace.devices._may_have_cuda", lambda: False)
     # Pictures by the field.
-    ready = dataclasses.replace(SMALL, readiness=ReadinessConfig(psnr_db=1), picture=FIELD_ONLY.picture)
+    ready = dataclasses.replace(SMALL, readiness=ReadinessConfig(psnr_db=1), view=FIELD_ONLY.view)
     space, whole = trained(6, ready), trained(6, ready)
     monkeypatch.setattr(space.device, call, no_memory)
     assert not space.status.warning

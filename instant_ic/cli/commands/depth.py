@@ -71,7 +71,7 @@ def estimate(args: argparse.Namespace) -> int:
     import numpy as np
 
     from instant_ic.cli.commands.vspace import write_image
-    from instant_ic.depth.colour import depth_picture
+    from instant_ic.depth.colour import coloured_depth
     from instant_ic.util.limits import load_image
 
     picture = load_image(args.image, cv2.IMREAD_COLOR)
@@ -88,7 +88,7 @@ def estimate(args: argparse.Namespace) -> int:
     took = time.perf_counter() - begin
     if args.npy:
         np.save(args.npy, depth)
-    write_image(args.output, depth_picture(depth))
+    write_image(args.output, coloured_depth(depth))
     low, middle, high = np.percentile(depth[depth > 0], (1, 50, 99)) if (depth > 0).any() else (0.0, 0.0, 0.0)
     print(f"{model.manifest.name} on {model.provider}: {took:.3f} s, {model.manifest.output_kind}, "
           f"1 % {low:.2f}, median {middle:.2f}, 99 % {high:.2f}; wrote {args.output}")  # fmt: skip

@@ -55,7 +55,7 @@ def add_kind(kinds: Any) -> None:
 
 def evaluate_depth(args: argparse.Namespace) -> int:
     """Score each panorama; print and write the figures."""
-    from instant_ic.depth.files import DepthFileError, load_depth, load_picture
+    from instant_ic.depth.files import DepthFileError, load_depth, load_rgb
     from instant_ic.depth.manifest import InferenceError
     from instant_ic.experiments.depth import DepthEvaluationError, Scored, pair, report
     from instant_ic.experiments.plots import save_depth_sheet
@@ -76,7 +76,7 @@ def evaluate_depth(args: argparse.Namespace) -> int:
         for done, (image, truth) in enumerate(pairs, 1):
             try:
                 truth_m = load_depth(truth, args.png_unit) if truth is not None else None
-                scored = evaluator.score(image.name, load_picture(image), truth_m)
+                scored = evaluator.score(image.name, load_rgb(image), truth_m)
                 rows.append(scored.as_dict() | {"image": str(image), "truth": str(truth) if truth else None})
                 if args.plot and len(shown) < _SHOWN:
                     shown.append(scored)

@@ -134,9 +134,9 @@ def train(args: argparse.Namespace) -> int:
 
 def _keyframe(args: argparse.Namespace) -> tuple[NDArray[np.uint8], NDArray[np.float32], float]:
     """Load the panorama, and load or estimate its depth in metres and the depth's relative standard deviation."""
-    from instant_ic.depth.files import load_depth, load_picture
+    from instant_ic.depth.files import load_depth, load_rgb
 
-    rgb = load_picture(args.panorama)
+    rgb = load_rgb(args.panorama)
     if args.depth:
         return rgb, load_depth(args.depth), args.depth_sigma or GIVEN_SIGMA
     return rgb, estimated_depth(args.model, rgb), args.depth_sigma or MODEL_SIGMA
