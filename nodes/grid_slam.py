@@ -68,14 +68,14 @@ class GridSlamNode(Node[GridSlamConfig]):
         if self.queue.add_odometry(msg.stamp_ns(message), msg.pose2_from_message(message)):
             self.place_ready()
         else:
-            self.diagnose("odometry", WARN, "dropped a message that is not finite, or not newer than the last")
+            self.diagnose("odometry", WARN, "A message was dropped: not finite, or not newer than the last")
 
     def on_scan(self, message: Any) -> None:
         now_ns = self.clock.now_ns()
         try:
             back_s = self.queue.check_stamp(msg.stamp_ns(message), now_ns)
             if back_s > 0:
-                self.diagnose("time", WARN, f"time went back by {back_s:.1f} s: a new map begins")
+                self.diagnose("time", WARN, f"Time went back by {back_s:.1f} s. A new map begins")
                 self.restart()
             scan, mount = slam_messages.read_scan(message, self.mounts)
             self.queue.add(scan, mount, now_ns, self.clock.steady_ns())

@@ -78,7 +78,7 @@ class VirtualRobotNode(Node[VirtualRobotConfig]):
         self.stepped_ns = steady_ns
         state = self.state.fresh
         if state is None:
-            self.diagnose("state", WARN, "the arbiter is silent: the v-bot stands still")
+            self.diagnose("state", WARN, "The arbiter does not report. The v-bot stands")
             self.robot.place(self.robot.pose, (0.0, 0.0))
             if self.action is None:
                 return  # no pose yet

@@ -44,9 +44,9 @@ def read_scan(message: LaserScan, mounts: TransformBuffer) -> tuple[Scan, FloatA
         mount = level_mount(mounts.lookup("base_link", message.header.frame_id))
         return Scan(np.asarray(message.ranges), *angles, *limits, stamp_ns(message)), mount
     except TransformError as error:
-        raise ScanError(f"the laser's mount is not known yet: {error}") from None
+        raise ScanError(f"The laser's mount is not known yet: {error}") from None
     except ValueError as error:
-        raise ScanError(f"the scan cannot be used: {error}") from None
+        raise ScanError(f"The scan cannot be used: {error}") from None
 
 
 def integrity_message(slam: GridSlam, result: SlamResult, stamp: int) -> Any:
@@ -123,5 +123,5 @@ def run_job(item: tuple[GridSlam, Callable[[], FoundPlace | LoopOutcome]]) -> Jo
     try:
         return JobResult(slam, job())
     except Exception as error:  # noqa: BLE001 - scans go on
-        text = f"loop closure failed and is off until the node restarts: {type(error).__name__}: {error}"
+        text = f"Loop closure has failed ({type(error).__name__}: {error}). Restart the node to use it again"
         return JobResult(slam, None, Diagnosis("loops", Level.ERROR, text))

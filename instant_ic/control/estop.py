@@ -50,9 +50,9 @@ class EstopLatch:
     def diagnosis(self) -> Diagnosis:
         """The state of the latch: who pressed the emergency stop, and how to release it."""
         if not self.stopped:
-            return Diagnosis("emergency stop", Level.OK, "released")
+            return Diagnosis("emergency stop", Level.OK, "Released")
         by = "the robot (its button, or a fault of its motor controller)" if self.button else self.publisher
-        return Diagnosis("emergency stop", Level.WARN, f"latched by {by}: release it on the operator's page")
+        return Diagnosis("emergency stop", Level.WARN, f"Latched by {by}. Release it on the operator's page")
 
     def hear(self, pressed: bool, publisher: str, publish_ns: int, received_ns: int, holder: str | None = None) -> str:
         """Take a message of ``/operator/estop``.

@@ -86,7 +86,7 @@ class Navigator:
     ) -> NavigatorStep:
         """Return the twist from ``pose`` to ``subgoal`` (x, y, yaw) in the costmap's frame; zero if not finite."""
         if not np.isfinite([*pose, speed_m_s, *subgoal, *subgoal_velocity]).all():
-            unknown = replace(self._plan, reached=False, reason="pose, subgoal or a speed is not a number")
+            unknown = replace(self._plan, reached=False, reason="the pose, the subgoal or a speed is not a number")
             return NavigatorStep((0.0, 0.0), "end", unknown, False)
         due = self._planned_ns is None or now_ns - self._planned_ns >= self.replan_period_s * 1e9
         if due:

@@ -89,9 +89,9 @@ class Surroundings:
         self.findings: dict[str, Diagnosis] = {}
         """Diagnoses by input: scan, points, costmap, pose."""
         if not config.points.enabled:
-            self._find("points", True, "not used (costmap.points.enabled is false)")
+            self._find("points", True, "3D points are not used (costmap.points.enabled is false)")
         else:
-            self._find("points", True, "no 3D points yet: low and hanging things are not seen")
+            self._find("points", True, "No 3D points yet. Low and hanging things are not seen")
         self._tf = tf
         self._footprint = footprint
         self._measured = self._unmeasured = np.zeros(0, np.bool_)  # beams so far, and in the newest scan
@@ -131,7 +131,7 @@ class Surroundings:
         try:
             base_from_odom = self._tf.lookup("base_link", "odom")
         except TransformError as error:
-            self._find("scan", False, f"scan cannot be placed: {error}")
+            self._find("scan", False, f"The scan cannot be placed: {error}")
             return None
         return np.asarray(near @ base_from_odom[:2, :2].T + base_from_odom[:2, 3])
 
@@ -170,8 +170,8 @@ class Surroundings:
         points_ns = -1 if cloud is None else self._take(cloud)
         pose = self.robot_pose()
         if pose is None or scan is None or not scan.usable:
-            missing = "no pose" if pose is None else "no LiDAR scan"
-            self._find("costmap", self.costmap is None, f"costmap is not updated: {missing}")
+            missing = "there is no pose" if pose is None else "there is no LiDAR scan"
+            self._find("costmap", self.costmap is None, f"The costmap is not updated: {missing}")
             return None
         if (scan.stamp_ns, points_ns) == self._in_costmap:
             return None
@@ -180,7 +180,7 @@ class Surroundings:
             map_from_odom = self._tf.lookup("map", "odom")
             map_from_lidar = map_from_odom @ self._tf.lookup("odom", scan.frame, scan.stamp_ns)
         except TransformError as error:
-            self._find("costmap", False, f"costmap is not updated: {error}")
+            self._find("costmap", False, f"The costmap is not updated: {error}")
             return None
         self._correct(map_from_odom)
         rays = scan_rays(*scan.beams, map_from_lidar, self.config)
@@ -213,7 +213,7 @@ class Surroundings:
         )
         moved_m, turned_rad = math.hypot(x, y), abs(yaw)
         if moved_m > _JUMP_M or turned_rad > _JUMP_RAD:
-            log.info("the map has jumped: the marks of scans are cleared from the costmap")
+            log.info("the map has jumped; the costmap has forgotten its marks")
             self._rolling.reset()
         elif moved_m > _CORRECTED_M or turned_rad > _CORRECTED_RAD:
             self._rolling.carry(pose2_from_matrix(map_from_odom @ inverse(before)))
@@ -223,12 +223,12 @@ class Surroundings:
 
     def _place(self, scan: ArrivedScan) -> None:
         if not scan.usable:
-            self._find("scan", False, "scan cannot be used: no beam has measured anything")
+            self._find("scan", False, "The scan cannot be used: no beam has measured anything. Uncover the LiDAR")
             return
         try:
             odom_from_lidar = self._tf.lookup("odom", scan.frame, scan.stamp_ns)
         except TransformError as error:
-            self._find("scan", False, f"scan cannot be placed: {error}")
+            self._find("scan", False, f"The scan cannot be placed: {error}")
             return
         self.blind = self._blind(scan)
         points = scan_points(*scan.beams)

@@ -11,13 +11,19 @@ from instant_ic.slam.grid_slam import GridSlam, SlamResult
 from instant_ic.util.diagnosis import Diagnosis, Level
 
 _STATUSES = {
-    SlamStatus.FIRST: (Level.OK, "map started"),
-    SlamStatus.TRACKED: (Level.OK, "tracking"),
-    SlamStatus.RECOVERED: (Level.WARN, "odometry was far off; the scan was found again by the wide search"),
-    SlamStatus.LOST: (Level.ERROR, "the scan fits nowhere near; going on by odometry"),
-    SlamStatus.RESTARTED: (Level.ERROR, "the robot is lost; it maps apart from its map until its place is recognized"),
-    SlamStatus.NO_POINTS: (Level.WARN, "the scan has too few points; going on by odometry"),
-    SlamStatus.TIME_BACKWARDS: (Level.WARN, "the scan is not newer than the one before and is ignored"),
+    SlamStatus.FIRST: (Level.OK, "A map has been started"),
+    SlamStatus.TRACKED: (Level.OK, "Tracking"),
+    SlamStatus.RECOVERED: (
+        Level.WARN,
+        "Odometry was far off; the wide search has found the scan. Check tracks and encoders",
+    ),
+    SlamStatus.LOST: (Level.ERROR, "The scan fits nowhere near; the pose follows odometry. Drive slowly"),
+    SlamStatus.RESTARTED: (
+        Level.ERROR,
+        "The robot is lost and maps apart from its map. Drive slowly until its place is recognized",
+    ),
+    SlamStatus.NO_POINTS: (Level.WARN, "The scan has too few points; the pose follows odometry. Uncover the LiDAR"),
+    SlamStatus.TIME_BACKWARDS: (Level.WARN, "The scan is not newer than the last and is ignored"),
 }
 
 
@@ -40,16 +46,16 @@ def diagnoses(slam: GridSlam, result: SlamResult, with_odometry: bool, use_wheel
         "heading_bound_rad": round(trust.heading_bound_rad, 4),
         "contradiction": round(slam.monitor.contradiction, 3),
     }
-    text = "the pose is trusted" if trust.trusted else "the robot is probably not where the pose says"
+    text = "The pose is trusted" if trust.trusted else "The robot is probably elsewhere. Check where it stands"
     yield Diagnosis("integrity", Level.OK if trust.trusted else Level.ERROR, text, figures)
     if not result.localized:
         why = "ambiguous: several places look alike" if slam.saved and slam.saved.ambiguous else "not known yet"
-        text = f"the robot's place in the saved map is {why}: drive on, or set it (/initialpose)"
+        text = f"The robot's place in the saved map is {why}. Drive on, or set it (/initialpose)"
         yield Diagnosis("place", Level.WARN, text)
     elif slam.saved is not None:
-        yield Diagnosis("place", Level.OK, "found in the saved map")
+        yield Diagnosis("place", Level.OK, "Found in the saved map")
     level = Level.OK
-    text = "the robot moves as its tracks do" if with_odometry else "no wheels to compare with"
+    text = "The robot moves as its tracks do" if with_odometry else "No wheel odometry to compare with"
     if slam.contradiction.state:
         level, text = Level.ERROR, slam.contradiction.state.text
     figures = {
@@ -60,11 +66,16 @@ def diagnoses(slam: GridSlam, result: SlamResult, with_odometry: bool, use_wheel
     yield Diagnosis("motion", level, text, figures)
     if with_odometry:
         correction_m = round(float(np.hypot(*slam.map_from_odom[:2])), 3)
-        yield Diagnosis("odometry", Level.OK, "wheel odometry", {"correction_m": correction_m})
+        yield Diagnosis("odometry", Level.OK, "Wheel odometry", {"correction_m": correction_m})
     elif use_wheel_odom:
-        text = "no wheel odometry on /wheel/odom: LiDAR odometry is used instead"
+        text = "No wheel odometry on /wheel/odom; LiDAR odometry replaces it. Check crawler_base"
         yield Diagnosis("odometry", Level.WARN, text)
     else:
         yield Diagnosis("odometry", Level.OK, "LiDAR odometry (use_wheel_odom is false)")
     if slam.map.clipped:
-        yield Diagnosis("map", Level.WARN, "the map has reached max_size_m", {"points_left_out": slam.map.clipped})
+        yield Diagnosis(
+            "map",
+            Level.WARN,
+            "The map has reached max_size_m. Raise it, or start a new map",
+            {"points_left_out": slam.map.clipped},
+        )

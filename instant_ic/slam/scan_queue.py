@@ -47,7 +47,7 @@ class ScanQueue:
         self.config = config
         self.last_ns: int | None = None
         self.dropped = 0
-        self.state = Diagnosis("scan", Level.WARN, "no scan on /scan yet: is vlp16_driver running?")
+        self.state = Diagnosis("scan", Level.WARN, "No scan on /scan yet. Check that vlp16_driver runs")
         self._came_ns = 0
         self._wheel = OdometryBuffer()
         self._waiting: deque[QueuedScan] = deque()
@@ -74,12 +74,12 @@ class ScanQueue:
         age_s = (now_ns - stamp_ns) * 1e-9
         if abs(age_s) > self.config.max_scan_age_s:
             when = f"{age_s:.2f} s old" if age_s > 0 else f"{-age_s:.2f} s in the future"
-            raise ScanError(f"the scan is {when}: check the clocks, or set use_sim_time for a recording")
+            raise ScanError(f"The scan is {when}. Check the clocks, or set use_sim_time for a recording")
         if self.last_ns is None or stamp_ns > self.last_ns:
             return 0.0
         back_s = (self.last_ns - stamp_ns) * 1e-9
         if back_s <= TIME_JUMP_S:
-            raise ScanError(f"the scan is not newer than the one before ({back_s:.3f} s back in time)")
+            raise ScanError(f"The scan is not newer than the last ({back_s:.3f} s back in time)")
         return back_s
 
     def drop(self, reason: str) -> None:
@@ -91,13 +91,15 @@ class ScanQueue:
         """Return the state at a steady time: an error once no scan has arrived for ``max_scan_age_s``."""
         age_s = (steady_ns - self._came_ns) * 1e-9
         if self.last_ns is not None and age_s > self.config.max_scan_age_s:
-            return Diagnosis("scan", Level.ERROR, f"no scan for {age_s:.1f} s", {"dropped": self.dropped})
+            return Diagnosis(
+                "scan", Level.ERROR, f"No scan for {age_s:.1f} s. Check vlp16_driver", {"dropped": self.dropped}
+            )
         return self.state
 
     def add(self, scan: Scan, base_from_laser: FloatArray, now_ns: int, steady_ns: int) -> None:
         """Add a scan with its mount (3,)."""
         self.last_ns, self._came_ns = scan.stamp_ns, steady_ns
-        self.state = Diagnosis("scan", Level.OK, "fresh", {"dropped": self.dropped})
+        self.state = Diagnosis("scan", Level.OK, "Fresh", {"dropped": self.dropped})
         self._waiting.append(QueuedScan(scan, base_from_laser, now_ns))
 
     @property

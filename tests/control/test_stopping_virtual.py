@@ -77,7 +77,7 @@ def test_what_waited_while_a_node_was_busy_is_as_old_as_its_stamp(late_s: float,
             bus.publish(topic, stack.bus.last(topic))
         bus.advance(0.06)
         assert bool(bus.messages("/nav/cmd_vel")) is drives
-        assert (nodes[0].diagnoses()["state"][1] == "the arbiter is silent: the v-bot stands still") is not drives
+        assert (nodes[0].diagnoses()["state"][1] == "The arbiter does not report. The v-bot stands") is not drives
 
 
 def test_a_page_that_reports_no_number_as_the_age_of_its_view_shows_none() -> None:

@@ -81,7 +81,7 @@ def test_silent_scans_are_reported_after_the_clock_was_set(jump_s: int) -> None:
     clock.set(clock.steady_ns() + 2 * S)
     node.watch()
     level, text, _ = node.diagnoses()["scan"]
-    assert (level, text) == (ERROR, "no scan for 2.0 s")
+    assert (level, text) == (ERROR, "No scan for 2.0 s. Check vlp16_driver")
 
 
 def test_images_from_files_go_on_when_the_clock_is_set_back(tmp_path: Path) -> None:

@@ -65,7 +65,7 @@ def test_nothing_drives_while_the_stop_is_latched_not_even_the_arbiter_nor_any_s
         bench.run(1.0, v=0.4)
         assert bench.line.travelled_m == 0.0
         level, text = bench.diagnosis("emergency stop")
-        assert level == WARN and "latched by console" in text
+        assert level == WARN and "Latched by console" in text
 
 
 def test_no_command_given_before_the_release_drives_after_it() -> None:

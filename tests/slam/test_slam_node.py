@@ -193,7 +193,7 @@ def test_time_that_goes_far_back_begins_a_new_map() -> None:
     rig.wheel()
     rig.scan()
     assert len(rig.node.slam.front_end.trajectory) == 1
-    assert "a new map begins" in rig.node.diagnoses()["time"][1]
+    assert "A new map begins" in rig.node.diagnoses()["time"][1]
 
 
 def test_two_runs_are_the_same_bit_for_bit() -> None:
@@ -249,7 +249,7 @@ def test_the_place_in_a_saved_map_is_found(tmp_path: Path) -> None:
     rig.drive(0.2, 0.1, 30)
     errors = rig.pose_errors()
     assert len(errors) > 20 and max(errors) < 0.06
-    assert rig.node.diagnoses()["place"][:2] == (OK, "found in the saved map")
+    assert rig.node.diagnoses()["place"][:2] == (OK, "Found in the saved map")
     grid, _, _ = grid_array(rig.bus.last("/map"))
     assert (grid == 100).sum() > 100
     # Somebody says that it is elsewhere, a little wrong: the scans decide.
