@@ -39,7 +39,7 @@ export function showLatency(link, images) {
   const rate = link.commandHz ? ` · ${Math.round(link.commandHz)} /s` : "";
   put("command-ms", link.commandAgeMs, (value) => ms(value) + rate, 80, 200);
   const camera = images.rate(PANORAMA), view = images.rate(VIEW);
-  write(byId("rates"), camera || view ? `${camera.toFixed(0)} · ${view.toFixed(0)} /s` : "–");
+  write(byId("rates"), link.connected && (camera || view) ? `${camera.toFixed(0)} · ${view.toFixed(0)} /s` : "–");
 }
 
 /** @param {Health} health */
