@@ -39,7 +39,7 @@ _SETUP = """async ([width, height, full]) => {
         return {rgba: btoa(text), ms: performance.now() - start};
     };
     window.view = (mapFromLook, position, tanHalf) =>
-        read({tanHalf, mapFromLook, camera: {mapFromLook, position, tanHalf}, blend: 1, viewGain: plain});
+        read({tanHalf, mapFromLook, place: position, blend: 1, viewGain: plain});
 }"""
 
 

@@ -2,7 +2,7 @@
 // Estimate of the server's clock and quality of the link, from the round trips of pings.
 
 const KEPT = 100;
-const QUALITY_SAMPLES = 10;
+const QUALITY_SAMPLES = 60, LEAST_SAMPLES = 10;
 
 export class ServerClock {
   constructor() {
@@ -35,22 +35,22 @@ export class ServerClock {
     return this._offsetMs === null ? null : nowMs + this._offsetMs;
   }
 
-  /** Median round trip of the last 40 answers, ms; null before the first. */
+  /** Median round trip, ms; null before the first answer. */
   get roundTripMs() {
-    const recent = this._sorted(40);
-    return recent[recent.length >> 1] ?? null;
+    const sorted = this._sorted();
+    return sorted[sorted.length >> 1] ?? null;
   }
 
   /** Quality of the link by median and 90th percentile of the round trip; null until it is known. */
   get quality() {
-    if (this._samples.length < QUALITY_SAMPLES) return null;
-    const sorted = this._sorted(60), usual = sorted[sorted.length >> 1], slow = sorted[Math.floor(sorted.length * 0.9)];
+    if (this._samples.length < LEAST_SAMPLES) return null;
+    const sorted = this._sorted(), usual = sorted[sorted.length >> 1], slow = sorted[Math.floor(sorted.length * 0.9)];
     if (usual <= 80 && slow <= 150) return "good";
     return usual <= 200 && slow <= 400 ? "fair" : "poor";
   }
 
-  /** @param {number} count */
-  _sorted(count) {
-    return this._samples.slice(-count).map((sample) => sample.roundTrip).sort((a, b) => a - b);
+  /** Returns the newest round trips, ms, the shortest first. */
+  _sorted() {
+    return this._samples.slice(-QUALITY_SAMPLES).map((sample) => sample.roundTrip).sort((a, b) => a - b);
   }
 }

@@ -4,7 +4,7 @@
 /** @import { Link } from "./link.js" */
 /** @import { Look } from "./look.js" */
 /** @import { Mat3, Vec3 } from "./math.js" */
-/** @import { Camera, Layer, Photo, Surface } from "./layers.js" */
+/** @import { Layer, Photo, Surface } from "./layers.js" */
 /** @import { FrameOf, LayerData, LayersFrame, LayersHeader, Mesh, PageSettings, PanoramaHeader, State, ViewHeader } from "./messages.js" */
 /** @import { GlViewer } from "./viewer.js" */
 import { fitGains, plain, Releasing } from "./colour.js";
@@ -24,7 +24,7 @@ import { Prediction } from "./prediction.js";
  * @property {Mat3} viewFromLook
  * @property {[number, number]} viewTanHalf of the rendered view
  * @property {Glide | null} glide the camera's image from another place; null: as it was taken
- * @property {Camera | null} camera of the layers, which then take the place of the rendered view; null: there are none
+ * @property {Vec3 | null} place from which the layers are shown instead of the rendered view, m; null: there are none
  * @property {number} blend 0 panorama, 1 view
  * @property {Vec3} panoramaGain of the colours
  * @property {Vec3} viewGain
@@ -216,12 +216,12 @@ export class Images {
       viewFromLook: this.view ? relative(this.view.q) : identity,
       viewTanHalf: [viewTan, viewTan / (this.view?.aspect ?? 1)],
       glide,
-      camera: this.layers && this.rendersLayers ? this._camera(this.layers, mapFromLook, tanHalf, glide) : null,
+      place: this.layers && this.rendersLayers ? this._layersPlace(this.layers, glide) : null,
       blend: this.blend * this.blend * (3 - 2 * this.blend),
       panoramaGain: plain,
       viewGain: plain,
     };
-    if (starts && this.panorama && (this.view || scene.camera)) this._match(scene, now);
+    if (starts && this.panorama && (this.view || scene.place)) this._match(scene, now);
     scene.panoramaGain = this._gains[PANORAMA].at(now);
     scene.viewGain = this._gains[VIEW].at(now);
     if (Object.values(this._gains).some((gains) => gains.active)) this.changed = true;
@@ -243,12 +243,11 @@ export class Images {
   }
 
   /**
-   * Returns the camera of the layers; null if its pose is unknown. A gliding camera image and the layers share one place.
+   * Returns the place from which the layers are shown; null if it is unknown. A gliding camera image is shown from it too.
    * When the real robot is shown again, the place moves on with it, so that both images of the dissolve move alike.
-   * @param {LayersHeader} layers @param {Mat3} mapFromLook @param {[number, number]} tanHalf @param {Glide | null} glide
-   * @returns {Camera | null}
+   * @param {LayersHeader} layers @param {Glide | null} glide @returns {Vec3 | null}
    */
-  _camera({ mount }, mapFromLook, tanHalf, glide) {
+  _layersPlace({ mount }, glide) {
     const { own } = this.motion, before = this._followed;
     if (own) {
       const [x, y] = mounted(own, mount);
@@ -259,7 +258,7 @@ export class Images {
     if (glide) this._now = [glide.to[0], glide.to[1]];
     if (!this._now) return null;
     this.place = this._now;
-    return { mapFromLook, position: [...this._now, mount[2]], tanHalf };
+    return [...this._now, mount[2]];
   }
 
   /**

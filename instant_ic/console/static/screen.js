@@ -165,7 +165,7 @@ export class Screen {
   _renderView(scene) {
     const { viewer, images, look } = this;
     const resized = fit(viewer.canvas, viewer.slow ? SLOW_PIXELS : 1);
-    const key = rounded([scene.blend], 4) + rounded(scene.blend > 0 ? scene.camera?.position : scene.glide?.to, 3);
+    const key = rounded([scene.blend], 4) + rounded(scene.blend > 0 ? scene.place : scene.glide?.to, 3);
     const direction = [...scene.mapFromLook, look.vfov];
     // SLAM turns a standing robot by a fraction of a milliradian with every scan; the v-bot's pose has no such noise.
     const least = (images.moves ? LEAST_PIXELS : STILL_PIXELS) * 2 * this._tanHalf()[0] / viewer.canvas.width;
@@ -178,7 +178,7 @@ export class Screen {
     this._viewAt = this._steppedAt; // a frame that renders nothing needs no pause
     viewer.render(scene);
     images.noteRendered();
-    if (scene.camera && scene.blend > 0) images.countFrame(VIEW);
+    if (scene.place && scene.blend > 0) images.countFrame(VIEW);
     // For measurements: the rendered image and its position.
     const { motion, view, panorama, place } = images;
     const detail = { shown: shows(this.state), pose: motion.pose, blend: scene.blend, view, panorama, place };

@@ -140,18 +140,16 @@ export class GlViewer {
 
   /** @param {Scene} scene @param {number} width @param {number} height @param {Vec3} gain */
   _renderReal(scene, width, height, gain) {
-    const { glide, mapFromLook, tanHalf } = scene, image = this._panorama;
+    const { glide, panoramaFromLook, tanHalf } = scene, image = this._panorama;
     this.gl.viewport(0, 0, width, height);
-    if (!glide || !this._renderer.ready) this._renderer.renderFar(image, scene.panoramaFromLook, tanHalf, gain);
-    else {
-      const camera = { mapFromLook, position: glide.to, tanHalf };
-      this._renderer.render(camera, width, height, gain, { image, ...glide.from }, this.gl.isEnabled(this.gl.BLEND));
-    }
+    if (!glide || !this._renderer.ready) return this._renderer.renderFar(image, panoramaFromLook, tanHalf, gain);
+    const camera = { ...scene, position: glide.to }, photo = { image, ...glide.from };
+    this._renderer.render(camera, width, height, gain, photo, this.gl.isEnabled(this.gl.BLEND));
   }
 
   /** @param {Scene} scene @param {number} width @param {number} height @param {Vec3} gain */
   _renderVirtual(scene, width, height, gain) {
-    if (scene.camera && this._renderer.ready) return this._renderer.render(scene.camera, width, height, gain);
+    if (scene.place && this._renderer.ready) return this._renderer.render({ ...scene, position: scene.place }, width, height, gain);
     const gl = this.gl;
     gl.viewport(0, 0, width, height);
     // Beyond the rendered view's edge the camera's image continues, dim and grey.

@@ -23,8 +23,8 @@ function scenes(slow, duration, at) {
   for (; now < duration; now += 10) {
     const { panorama, state } = at(now);
     images.panorama = panorama || images.panorama;
-    const { glide, camera, blend, panoramaFromLook } = images.scene({ at_ms: now, twist: [0.3, 0], ...state }, { yaw: 0, pitch: 0 }, [1, 0.6], 10);
-    found.push({ glide: glide && glide.to[0], place: camera.position[0], blend, panoramaFromLook });
+    const { glide, place, blend, panoramaFromLook } = images.scene({ at_ms: now, twist: [0.3, 0], ...state }, { yaw: 0, pitch: 0 }, [1, 0.6], 10);
+    found.push({ glide: glide && glide.to[0], place: place[0], blend, panoramaFromLook });
   }
   return found;
 }
