@@ -27,16 +27,8 @@ _HARMLESS = {"/clock", *EVERY_NODES}
 """On any other topic a second publisher would mix the bag with the live robot."""
 
 
-def reached_base(nodes: Collection[NodeInfo], played: Mapping[str, str]) -> tuple[str, list[str]] | None:
-    """Find a base, real or simulated, that could obey the played messages, or a bridge that passes them to one.
-
-    Args:
-        nodes: running nodes, without the player.
-        played: topic on the bus → topic in the bag.
-
-    Returns:
-        Name of the base or bridge and the topics of the bag that would reach the robot; None where there is none.
-    """
+def _reached_base(nodes: Collection[NodeInfo], played: Mapping[str, str]) -> tuple[str, list[str]] | None:
+    """Return the name of a base or bridge, and the topics of the bag that would reach its robot; None without one."""
     live = {topic for node in nodes for topic in node.publishes} - _HARMLESS
     for base in nodes:
         if base.executable == _BASE:
@@ -57,7 +49,7 @@ def reached_base(nodes: Collection[NodeInfo], played: Mapping[str, str]) -> tupl
 
 
 def refuse_base(bag: str, run_dir: Path, nodes: Collection[NodeInfo], played: Mapping[str, str]) -> None:
-    """Refuse to play what a base in the run directory, real or simulated, could obey.
+    """Refuse to play what a base in the run directory, real or simulated, could obey, also one behind a bridge.
 
     Args:
         bag: name of the bag, for the error.
@@ -68,7 +60,7 @@ def refuse_base(bag: str, run_dir: Path, nodes: Collection[NodeInfo], played: Ma
     Raises:
         BagError: there is one, or a bridge to one.
     """
-    if reached := reached_base(nodes, played):
+    if reached := _reached_base(nodes, played):
         base, topics = reached
         left_out = " ".join(f"-x {topic}" for topic in topics)
         raise BagError(

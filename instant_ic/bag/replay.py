@@ -184,20 +184,16 @@ def _feed(
     message: BagMessage, bus: LockstepBus, running: Sequence[Node[Any]], made_frames: set[str], result: ReplayResult
 ) -> None:
     """Publish a message of the bag, or only advance the clock where a replayed node publishes it."""
-    made_topics = {publisher.topic for node in running for publisher in node.publishers}
-    payload = _what_to_feed(message, made_topics, made_frames)
+    payload: bytes | None = message.payload
+    if message.topic in TRANSFORM_TOPICS:
+        payload = without_children(message, made_frames)
+    elif message.topic in NEVER_PLAYED or any(
+        out.topic == message.topic for node in running for out in node.publishers
+    ):
+        payload = None
     if payload is None:
         result.left_out[message.topic] += 1
         bus.advance_to(message.stamp_ns)
     else:
         result.fed[message.topic] += 1
         bus.publish_bytes(message.topic, message.type_name, payload, message.stamp_ns, message.qos.latched)
-
-
-def _what_to_feed(message: BagMessage, made_topics: set[str], made_frames: set[str]) -> bytes | None:
-    """Return the message's bytes; None when a replayed node publishes it."""
-    if message.topic in TRANSFORM_TOPICS:
-        return without_children(message, made_frames)
-    if message.topic in made_topics or message.topic in NEVER_PLAYED:
-        return None
-    return message.payload
