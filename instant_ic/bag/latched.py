@@ -24,11 +24,9 @@ class LatchedValues:
         self._values = {key: v for key, v in self._values.items() if not (key[0] == topic and key[1] <= names)}
         self._values[topic, names] = message
 
-    def values(self, but: BagMessage | None = None) -> list[BagMessage]:
-        """Return all current values, oldest first, without those that ``but`` is about to replace."""
-        topic, names = ("", frozenset[str]()) if but is None else (but.topic, _names(but))
-        kept = [v for key, v in self._values.items() if not (key[0] == topic and key[1] <= names)]
-        return sorted(kept, key=lambda value: value.stamp_ns)
+    def values(self) -> list[BagMessage]:
+        """Return all current values, oldest first."""
+        return sorted(self._values.values(), key=lambda value: value.stamp_ns)
 
 
 class Repetitions:

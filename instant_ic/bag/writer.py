@@ -116,14 +116,14 @@ class BagWriter(Closing):
             raise BagError(f"bag {self.path} is closed")
         stamp_ns, key = max(0, stamp_ns), (topic, type_name)
         qos = self._add(key, qos, schema)
-        latched = BagMessage(topic, type_name, bytes(payload), stamp_ns, qos, publisher) if qos.latched else None
-        if latched is not None:
-            self._latched.put(latched)
         try:
-            file = self._file_for(stamp_ns, latched)
+            file = self._file_for(stamp_ns)
         except BagError:
             self.lost = self.lost + Counter([topic])
             raise
+        finally:
+            if qos.latched:
+                self._latched.put(BagMessage(topic, type_name, bytes(payload), stamp_ns, qos, publisher))
         with self._giving_up(topic):
             file.write(key, stamp_ns, payload)
         self.bytes += len(payload)
@@ -190,7 +190,7 @@ class BagWriter(Closing):
             self._topics[topic] = (qos, schema)
         return self._topics[topic][0]
 
-    def _file_for(self, stamp_ns: int, latched: BagMessage | None) -> McapWriter:
+    def _file_for(self, stamp_ns: int) -> McapWriter:
         """Return the file for a message; start the next one, with the latched values, if necessary."""
         if self._file is not None and self._is_full(self._file, stamp_ns):
             self.end_file()
@@ -199,7 +199,7 @@ class BagWriter(Closing):
         file = self._file
         if self._opened > 1 and file.first_ns is None:
             with self._giving_up("latched values"):
-                for value in self._latched.values(but=latched):
+                for value in self._latched.values():
                     file.write((value.topic, value.type_name), stamp_ns, value.payload)
         return file
 
