@@ -19,8 +19,7 @@ from instant_ic.console.protocol import FrameKind
 from instant_ic.console.recording import RecorderError, RecordingDesk
 from instant_ic.console.server import ConsoleServer
 from instant_ic.console.view import PROBE_HZ, Look, ViewConfig, view_shape
-from instant_ic.geometry.poses import matrix_from_quaternion, pose_matrix, quaternion_from_matrix, wrap_angle
-from instant_ic.geometry.projections import equirect_directions, perspective_directions
+from instant_ic.geometry.poses import pose_matrix, quaternion_from_matrix, wrap_angle
 
 CAMERA_HEIGHT_M = 1.2
 STEP_S = 0.05
@@ -79,7 +78,7 @@ class Demo(ConsoleBackend):
         self.forced_mode = "real"
         self.faults: list[dict[str, str]] = []
         self.images = True
-        self.tint = (1.0, 1.0, 1.0)  # gains of the rendered view: blue, green, red
+        self.tint = (1.0, 1.0, 1.0)  # gains of the rendered view: red, green, blue
         self.mode = "real"
         self.reason = ""
         self.robot: Pose = np.zeros(3)
@@ -88,7 +87,7 @@ class Demo(ConsoleBackend):
         self._command = (0.0, 0.0)
         self.placing = threading.Lock()
         self._slow_due = 0.0
-        self._directions = equirect_directions(panorama_width, panorama_width // 2)
+        self._panorama_width = panorama_width
         self.panorama, self.panorama_camera = b"", np.zeros((4, 4))  # last panorama (JPEG) and its camera pose
         self.recorder = DemoRecorder()
         self._desk = RecordingDesk(self.recorder.ask, lambda status: self.server.publish("recording", status))
@@ -121,8 +120,8 @@ class Demo(ConsoleBackend):
         """Start the server and the robot."""
         self.server.start()
         grid, origin = demo_world.occupancy()
-        for kind, cells in ((FrameKind.MAP, grid), (FrameKind.COSTMAP, demo_world.inflate(grid, 0.05))):
-            image = grid_image(cells, 0.05, origin)
+        for kind, cells in ((FrameKind.MAP, grid), (FrameKind.COSTMAP, demo_world.inflate(grid))):
+            image = grid_image(cells, demo_world.RESOLUTION_M, origin)
             assert image is not None
             self.server.send_frame(kind, image.header, image.payload)
         for thread in self._threads:
@@ -232,7 +231,7 @@ class Demo(ConsoleBackend):
         captured_ms = self.server.now_ms()
         camera = _camera(self.robot)
         if not np.array_equal(self.panorama_camera, camera):  # a standing robot sees the same image
-            self.panorama = _jpeg(demo_world.shade(_position(camera), _turned(self._directions, camera)))
+            self.panorama = _jpeg(demo_world.panorama(camera, self._panorama_width).rgb)
             self.panorama_camera = camera
         header = {"captured_ms": captured_ms, "q": quaternion_from_matrix(camera).tolist(), "p": camera[:3, 3].tolist()}
         self.server.send_frame(FrameKind.PANORAMA, header, self.panorama)
@@ -242,8 +241,7 @@ class Demo(ConsoleBackend):
         look = self.look
         fov_rad, width, height = view_shape(look, self._view)
         camera = _camera(self.vbot if self.mode == "virtual" else self.robot) @ look.rotation()
-        directions = _turned(perspective_directions(width, height, fov_rad), camera)
-        image = demo_world.shade(_position(camera), directions)
+        image = demo_world.perspective(camera, width, height, fov_rad).rgb
         image = np.clip(image * np.array(self.tint), 0, 255).astype(np.uint8)
         header = {
             "captured_ms": captured_ms,
@@ -258,19 +256,8 @@ def _camera(pose: Pose) -> NDArray[np.float64]:
     return pose_matrix(pose[0], pose[1], CAMERA_HEIGHT_M, 0.0, 0.0, pose[2])
 
 
-def _position(camera: NDArray[np.float64]) -> tuple[float, float, float]:
-    x, y, z = camera[:3, 3]
-    return float(x), float(y), float(z)
-
-
-def _turned(directions: NDArray[np.float32], camera: NDArray[np.float64]) -> NDArray[np.float32]:
-    rotation = matrix_from_quaternion(quaternion_from_matrix(camera))[:3, :3].astype(np.float32)
-    turned: NDArray[np.float32] = directions @ rotation.T
-    return turned
-
-
-def _jpeg(image: NDArray[np.uint8]) -> bytes:
-    return cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, 88])[1].tobytes()
+def _jpeg(rgb: NDArray[np.uint8]) -> bytes:
+    return cv2.imencode(".jpg", rgb[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 88])[1].tobytes()
 
 
 def _moved(pose: Pose, v: float, w: float, seconds: float) -> Pose:

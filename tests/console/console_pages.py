@@ -17,7 +17,6 @@ from instant_ic.console.access import AccessConfig
 from instant_ic.console.config import ConsoleServerConfig
 from instant_ic.console.view import ViewConfig
 from instant_ic.geometry.poses import pose_matrix
-from instant_ic.geometry.projections import perspective_directions
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
 FLAGS = [
@@ -143,9 +142,8 @@ def room_seen(pose, yaw, pitch, vfov_deg=60.0):
     """What the page should show, drawn from the room itself: (H, W, 3) RGB."""
     width, height = SIZE["width"] // 4, SIZE["height"] // 4
     hfov = 2 * math.atan(math.tan(math.radians(vfov_deg) / 2) * width / height)
-    map_from_look = pose_matrix(yaw=pose[2]) @ pose_matrix(pitch=-pitch, yaw=yaw)
-    directions = perspective_directions(width, height, hfov) @ map_from_look[:3, :3].T.astype(np.float32)
-    return demo_world.shade((pose[0], pose[1], 1.2), directions)[..., ::-1].astype(float)
+    map_from_look = pose_matrix(pose[0], pose[1], 1.2, yaw=pose[2]) @ pose_matrix(pitch=-pitch, yaw=yaw)
+    return demo_world.perspective(map_from_look, width, height, hfov).rgb.astype(float)
 
 
 def likeness(page, expected):

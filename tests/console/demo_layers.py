@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 
 from instant_ic.console.layers import PageLayers, page_layer
 from instant_ic.geometry.poses import Matrix
-from instant_ic.geometry.projections import equirect_directions
 from instant_ic.vspace.background import Background
 from instant_ic.vspace.config import GeometryConfig
 from instant_ic.vspace.prior import ROOM, prepare
@@ -24,22 +23,17 @@ def demo_layers(version: int, map_from_camera: Matrix, width: int = 768, depth_w
         width: of the panorama, pixels.
         depth_width: of its depth, pixels.
     """
-    x, y, z = (float(value) for value in map_from_camera[:3, 3])
-    rotation = map_from_camera[:3, :3].astype(np.float32)
-    rgb = demo_world.shade((x, y, z), equirect_directions(width, width // 2) @ rotation.T)[..., ::-1]
-    depth = demo_world.distances((x, y, z), equirect_directions(depth_width, depth_width // 2) @ rotation.T)
-    prior = prepare(np.ascontiguousarray(rgb), depth, map_from_camera, 0.0, GeometryConfig(), 4096)
+    rgb = demo_world.panorama(map_from_camera, width).rgb
+    depth = demo_world.panorama(map_from_camera, depth_width).depth_m
+    prior = prepare(rgb, depth, map_from_camera, 0.0, GeometryConfig(), 4096)
     behind = Background.of(prior)
     guessed = np.zeros(behind.inverse_depth.shape, np.bool_)
     for quads in (behind.quads, behind.sky_quads):
         guessed[quads[:, 0], quads[:, 1]] = True
     guess = page_layer(_jpeg(behind.rgb), behind.inverse_depth, guessed, behind.opacity / 255, map_from_camera)
     seen = page_layer(_jpeg(rgb), prior.inverse_depth, prior.content == ROOM, None, map_from_camera)
-    return PageLayers(version, (0.0, 0.0, z), (seen, guess))
+    return PageLayers(version, (0.0, 0.0, float(map_from_camera[2, 3])), (seen, guess))
 
 
 def _jpeg(rgb: NDArray[np.uint8]) -> bytes:
-    ok, data = cv2.imencode(".jpg", np.ascontiguousarray(rgb[..., ::-1]))
-    if not ok:
-        raise ValueError(f"JPEG encoder failed on an image of shape {rgb.shape}")
-    return bytes(data.tobytes())
+    return cv2.imencode(".jpg", rgb[..., ::-1])[1].tobytes()

@@ -11,7 +11,7 @@ from instant_ic.console import FrameKind
 from instant_ic.geometry.poses import quaternion_from_matrix
 
 pytestmark = BROWSER_TEST
-KEYFRAME = np.array([1.6, 0.2, 0.3])  # a box is 1.4 m ahead
+KEYFRAME = np.array([0.2, -0.3, 0.3])  # a box is 1.5 m ahead
 DRAWN = """
     window.drawn = [];
     addEventListener("rendered", ({detail: {place, pose, blend}}) => drawn.push({place, pose, blend}));
@@ -57,7 +57,7 @@ def test_the_view_is_the_room_seen_from_the_vbot_and_no_view_is_requested(open_p
     expect_body(page, "blend", "1.00")
     wait_until(lambda: not demo.server.needs_views(), page, "the page renders by itself")
     found = []
-    for pose in (tuple(KEYFRAME), (1.9, 0.2, 0.1), (1.4, 0.5, -0.5)):
+    for pose in (tuple(KEYFRAME), (0.5, -0.3, 0.1), (0.0, 0.0, -0.5)):
         demo.place(*pose)
         wait_place(page, *pose)
         picture, expected = picture_of(page), room_seen(pose, 0.0, demo.look.pitch)
@@ -99,7 +99,7 @@ def test_the_dissolve_mixes_two_views_of_the_same_place(open_page, room):
 def test_the_cameras_image_is_shown_from_where_the_robot_is_now_until_a_key_switches_it_off(open_page, room):
     demo = room
     demo.forced_mode, demo.images = "real", True
-    there = (1.9, 0.2, 0.3)
+    there = (0.5, -0.3, 0.3)
     try:
         demo.place(*KEYFRAME)
         page = open_layers(open_page, demo, "?quality=full")  # on the CPU it is off at first

@@ -22,7 +22,7 @@ from console_pages import (
 pytestmark = BROWSER_TEST
 # Long enough that a slow machine draws several pictures of each passage.
 SLOW_PASSAGE = {"dissolve_ms": 1500, "ease_ms": 1500, "colour_release_s": 60}
-TINT = (0.72, 0.9, 1.08)  # blue, green, red
+TINT = (1.08, 0.9, 0.72)  # red, green, blue
 
 WATCH = """
     // Every picture drawn, small, and what was drawn.
