@@ -100,10 +100,10 @@ def transforms(
 ) -> Iterator[tuple[str, str, Matrix]]:
     """Yield the transforms to broadcast after a scan: parent, child and parent_from_child (4, 4)."""
     if not with_odometry:
-        yield "odom", "base_link", matrix_from_pose2(slam.odom_from_base)
+        yield "odom", "base_link", matrix_from_pose2(slam.frames.odom_from_base)
     # A robot that is lost keeps the frames that it had: it may drive on, slowly, until its place is recognized.
     if slam.in_map_frame:
-        map_from_odom = limiter.follow(slam.map_from_odom, slam.odom_from_base, stamp_ns)
+        map_from_odom = limiter.follow(slam.frames.map_from_odom, slam.frames.odom_from_base, stamp_ns)
         yield "map", "odom", matrix_from_pose2(map_from_odom)
     else:
         limiter.reset()

@@ -225,16 +225,6 @@ class GridSlam:
         return self.frames.map_from_base
 
     @property
-    def odom_from_base(self) -> FloatArray:
-        """Pose of the last scan in odometry, (3,)."""
-        return self.frames.odom_from_base
-
-    @property
-    def map_from_odom(self) -> FloatArray:
-        """Pose of odometry's frame in the map, (3,)."""
-        return self.frames.map_from_odom
-
-    @property
     def saved(self) -> SavedMap | None:
         """A map in which the robot is located, or searched for; None while it makes its first map."""
         return None if self._relocalization is None else self._relocalization.saved

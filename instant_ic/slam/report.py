@@ -65,7 +65,7 @@ def diagnoses(slam: GridSlam, result: SlamResult, with_odometry: bool, use_wheel
     }
     yield Diagnosis("motion", level, text, figures)
     if with_odometry:
-        correction_m = round(float(np.hypot(*slam.map_from_odom[:2])), 3)
+        correction_m = round(float(np.hypot(*slam.frames.map_from_odom[:2])), 3)
         yield Diagnosis("odometry", Level.OK, "Wheel odometry", {"correction_m": correction_m})
     elif use_wheel_odom:
         text = "No wheel odometry on /wheel/odom; LiDAR odometry replaces it. Check crawler_base"

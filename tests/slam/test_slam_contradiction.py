@@ -149,7 +149,7 @@ def drive(
 ) -> int:
     """Drive from where the SLAM is, and return the scans until the first new contradiction, at most ``scans``."""
     before = slam.contradiction.count
-    pose, odometry = slam.map_from_base, slam.odom_from_base
+    pose, odometry = slam.map_from_base, slam.frames.odom_from_base
     for k in range(scans):
         pose = compose2(pose, [true[0], 0.0, true[1]])
         odometry = compose2(odometry, [wheels[0], 0.0, wheels[1]])

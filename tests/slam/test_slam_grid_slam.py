@@ -64,8 +64,8 @@ def test_l_corridor_there_and_back_on_slipping_tracks() -> None:
     assert errors[:, 1].max() < math.radians(0.5)
     assert {result.status for result in drive.results[1:]} == {SlamStatus.TRACKED}
     # All corrections are in map→odom; odometry itself is as it was given.
-    assert np.array_equal(drive.slam.odom_from_base, drive.odometry)
-    again = compose2(drive.slam.map_from_odom, drive.odometry)
+    assert np.array_equal(drive.slam.frames.odom_from_base, drive.odometry)
+    again = compose2(drive.slam.frames.map_from_odom, drive.odometry)
     assert np.allclose(again, drive.slam.map_from_base, atol=1e-9)
 
 
@@ -86,20 +86,20 @@ def test_without_odometry_the_scans_suffice() -> None:
     assert np.array(drive.errors)[:, 0].max() < 0.03
     assert np.array(drive.errors)[:, 1].max() < math.radians(1.0)
     # LiDAR odometry carries odom→base_link; map→odom has nothing to correct.
-    assert np.allclose(drive.slam.odom_from_base, drive.slam.map_from_base, atol=1e-9)
-    assert np.allclose(drive.slam.map_from_odom, 0)
+    assert np.allclose(drive.slam.frames.odom_from_base, drive.slam.map_from_base, atol=1e-9)
+    assert np.allclose(drive.slam.frames.map_from_odom, 0)
 
 
 def test_odometry_that_stops_and_comes_back() -> None:
     drive = Drive(box_room())
     drive.go(0.4, 0.1, 20, slip_v=1.2)
-    before = drive.slam.map_from_odom.copy()
+    before = drive.slam.frames.map_from_odom.copy()
     drive.go(0.4, 0.1, 10, odometry=False)
-    assert np.array_equal(drive.slam.map_from_odom, before)
-    assert np.allclose(compose2(before, drive.slam.odom_from_base), drive.slam.map_from_base, atol=1e-9)
+    assert np.array_equal(drive.slam.frames.map_from_odom, before)
+    assert np.allclose(compose2(before, drive.slam.frames.odom_from_base), drive.slam.map_from_base, atol=1e-9)
     drive.go(0.4, 0.1, 10, slip_v=1.2)
     assert np.array(drive.errors)[:, 0].max() < 0.03
-    assert np.array_equal(drive.slam.odom_from_base, drive.odometry)
+    assert np.array_equal(drive.slam.frames.odom_from_base, drive.odometry)
 
 
 def test_the_first_pose_is_odometrys() -> None:
@@ -168,12 +168,12 @@ def test_an_empty_first_scan_starts_nothing() -> None:
 def test_time_that_does_not_go_forward_changes_nothing(back_ns: int) -> None:
     drive = Drive(box_room())
     drive.go(0.4, 0.2, 10)
-    before = drive.slam.map_from_base.copy(), drive.slam.map_from_odom.copy(), drive.slam.map.version
+    before = drive.slam.map_from_base.copy(), drive.slam.frames.map_from_odom.copy(), drive.slam.map.version
     scan = drive.world.scan(np.array([1.0, 0.0, 0.5]), drive.stamp_ns - back_ns)
     result = drive.slam.process(scan, np.array([1.0, 0.0, 0.5]))
     assert result.status is SlamStatus.TIME_BACKWARDS
     assert np.array_equal(result.map_from_base, before[0])
-    assert np.array_equal(drive.slam.map_from_odom, before[1])
+    assert np.array_equal(drive.slam.frames.map_from_odom, before[1])
     assert drive.slam.map.version == before[2]
     drive.go(0.4, 0.2, 5)
     assert drive.errors[-1][0] < 0.02

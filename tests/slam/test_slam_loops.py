@@ -69,7 +69,7 @@ def test_a_loop_is_closed(ring: tuple[Drive, GridSlam, list[SlamResult]]) -> Non
     assert metres[-1] < 0.1 and degrees[-1] < 1.0
     wheels, _ = trajectory_errors(np.array([e.odom_pose for e in journey.entries]), journey.truth)
     assert wheels[-1] > 0.5  # what there was to correct
-    assert np.array_equal(slam.odom_from_base, journey.entries[-1].odom_pose)  # odometry stays what it was
+    assert np.array_equal(slam.frames.odom_from_base, journey.entries[-1].odom_pose)  # odometry stays what it was
 
 
 def test_drift_grows_and_ends_with_the_loop(ring: tuple[Drive, GridSlam, list[SlamResult]]) -> None:

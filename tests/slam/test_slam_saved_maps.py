@@ -165,8 +165,8 @@ def test_the_place_is_found_without_a_hint(made: tuple[Path, GridSlam], localize
     assert max(math.hypot(e[0], e[1]) for e in errors) < 0.06
     assert max(abs(e[2]) for e in errors) < math.radians(1.0)
     # Odometry is untouched, all of it is in map→odom.
-    assert np.array_equal(slam.odom_from_base, journey.entries[-1].odom_pose)
-    assert compose2(slam.map_from_odom, slam.odom_from_base) == pytest.approx(slam.map_from_base)
+    assert np.array_equal(slam.frames.odom_from_base, journey.entries[-1].odom_pose)
+    assert compose2(slam.frames.map_from_odom, slam.frames.odom_from_base) == pytest.approx(slam.map_from_base)
     if localize:
         assert np.array_equal(slam.grid().values, load_grid(stem).values)
         assert len(slam.front_end.trajectory) < 12
@@ -189,7 +189,7 @@ def test_a_robot_carried_off_is_found_again(made: tuple[Path, GridSlam]) -> None
     assert slam.localized
     # Lifted, and set down in the other room: odometry says nothing of it.
     other = drive(WALLS, [(-2.0, -1.0), (1.5, -1.0), (1.5, 2.0)], LASER, 6, step_m=0.15)
-    held = slam.odom_from_base
+    held = slam.frames.odom_from_base
     last_ns = journey.entries[-1].scan.stamp_ns
     moved = [
         replace(e, scan=replace(e.scan, stamp_ns=e.scan.stamp_ns + last_ns), odom_pose=compose2(held, e.odom_pose))
