@@ -32,9 +32,11 @@ class ThetaCameraNode(Node[ThetaCameraConfig]):
             raise NodeError(str(error)) from None
         self.diagnose("camera", WARN, f"connecting to {config.url}")
         self.timer(1.0, self.check)
-        if self.lockstep:
-            self.play_in_lockstep()
+        if isinstance(self.camera, FileCamera):
+            self.play_files(self.camera)
             return
+        if self.lockstep:
+            raise NodeError(f"source {config.source} cannot run in lockstep: use source:=files")
         self.loop = CameraLoop(
             self.camera,
             on_frame=self.on_frame,
@@ -53,19 +55,16 @@ class ThetaCameraNode(Node[ThetaCameraConfig]):
         super().reconfigure(config)
         self.broadcast_mount()
 
-    def play_in_lockstep(self) -> None:
-        """Play files on the node's own timer; devices have their own time and cannot be stepped."""
-        camera = self.camera
-        if not isinstance(camera, FileCamera):
-            raise NodeError(f"source {self.config.source} cannot run in lockstep: use source:=files")
+    def play_files(self, camera: FileCamera) -> None:
+        """Play files on the node's own timer; devices have their own time."""
         try:
             self.on_event(True, camera.connect())
         except CameraError as error:
             raise NodeError(str(error)) from error
-        self.timer(1.0 / self.config.files.rate_hz, lambda: self.publish(camera.next_frame()))
+        self.timer(1.0 / self.config.files.rate_hz, lambda: self.publish(camera.read()))
 
     def on_frame(self, frame: Frame) -> None:
-        """Publish a device's image unless it is a copy or empty; runs on the camera's thread. Files may repeat."""
+        """Publish a device's image unless it is a copy or empty, on the camera's thread. Video files may repeat."""
         if self.camera.recorded or self.images.is_live(frame):
             self.publish(frame)
 

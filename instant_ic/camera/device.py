@@ -35,7 +35,7 @@ def open_camera(config: ThetaCameraConfig, now_ns: Callable[[], int]) -> Camera:
         return ThetaCamera(ThetaClient(config.url, config.theta, user, password), now_ns)
     if config.source == "video":
         return VideoCamera(config.url, config.video, now_ns, user, password)
-    return FileCamera(config.url, config.files, now_ns)
+    return FileCamera(config.url, now_ns)
 
 
 def _credentials(file: str) -> tuple[str, str]:

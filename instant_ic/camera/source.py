@@ -38,7 +38,7 @@ class Camera(Closing):
     """A source of frames.
 
     Example:
-        >>> with FileCamera(FilesConfig(path="pano.jpg", rate_hz=5.0)) as camera:   # doctest: +SKIP
+        >>> with FileCamera("pano.jpg") as camera:      # doctest: +SKIP
         ...     frame = camera.read()
     """
 
@@ -56,7 +56,7 @@ class Camera(Closing):
         self.advice = ""
         """Advice to the operator while images arrive; empty if there is none."""
         self.recorded = False
-        """True for images from files, which may be played again."""
+        """True for a video file, whose images may be played again."""
         self._latency_ns = round(latency_s * 1e9)
         self._now_ns = now_ns
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from fake_theta import jpeg
 
-from instant_ic.camera.config import FilesConfig, VideoConfig
+from instant_ic.camera.config import VideoConfig
 from instant_ic.camera.files import FileCamera
 from instant_ic.camera.loop import CameraLoop
 from instant_ic.camera.source import CameraError
@@ -23,33 +23,12 @@ def test_folder_in_the_order_of_names_with_jpegs_byte_for_byte(tmp_path: Path) -
     cv2.imwrite(str(tmp_path / "c.png"), np.full((16, 32, 3), 200, np.uint8))
     (tmp_path / "notes.txt").write_text("no picture")
     with FileCamera(tmp_path, now_ns=lambda: 7) as camera:
-        frames = [camera.next_frame() for _ in range(4)]
+        frames = [camera.read() for _ in range(4)]
     assert [frame.jpeg for frame in frames[:2]] == [jpeg(40), jpeg(80)]
     assert (frames[2].width, frames[2].height) == (32, 16)
     assert abs(int(cv2.imdecode(np.frombuffer(frames[2].jpeg, np.uint8), 1).mean()) - 200) <= 2
     assert frames[3].jpeg == jpeg(40)  # from the start again
     assert {frame.stamp_ns for frame in frames} == {7}
-
-
-def test_rate_is_kept_and_late_readers_are_not_flooded(tmp_path: Path) -> None:
-    (tmp_path / "a.jpg").write_bytes(jpeg(40))
-    now = [1_000_000_000]
-    waits: list[float] = []
-
-    def sleep(seconds: float) -> None:
-        waits.append(round(seconds, 6))
-        now[0] += round(seconds * 1e9)
-
-    camera = FileCamera(tmp_path / "a.jpg", FilesConfig(rate_hz=10.0), lambda: now[0], sleep)
-    with camera:
-        camera.read()
-        camera.read()
-        assert waits == [0.1]
-        now[0] += 550_000_000  # the reader was away
-        for _ in range(3):
-            camera.read()
-        # One picture at once, one to catch up with the rate, then at the rate again.
-        assert len(waits) == 2 and waits[1] == pytest.approx(0.1)
 
 
 def test_missing_empty_and_broken_files_are_told(tmp_path: Path) -> None:

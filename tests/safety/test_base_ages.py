@@ -9,7 +9,7 @@ from base_line import SetClock
 
 from instant_ic.bus import ERROR, SENSOR
 from instant_ic.bus.lockstep import LockstepBus
-from instant_ic.camera.files import FileCamera
+from instant_ic.camera.config import ThetaCameraConfig
 from instant_ic.cli.message_input import build
 from instant_ic.control.arbiter_config import ArbiterConfig
 from instant_ic.control.freshness import TimeoutConfig
@@ -29,6 +29,7 @@ from instant_ic.msg import (
 )
 from nodes.arbiter import ArbiterNode
 from nodes.grid_slam import GridSlamNode
+from nodes.theta_camera import ThetaCameraNode
 from nodes.virtual_robot import VirtualRobotNode
 
 S = 1_000_000_000
@@ -86,13 +87,13 @@ def test_silent_scans_are_reported_after_the_clock_was_set(jump_s: int) -> None:
 
 def test_images_from_files_go_on_when_the_clock_is_set_back(tmp_path: Path) -> None:
     cv2.imwrite(str(tmp_path / "a.png"), np.zeros((16, 32, 3), np.uint8))
-    now, waits = [START_NS], []
-    with FileCamera(tmp_path, now_ns=lambda: now[0], sleep=waits.append) as camera:
-        camera.read()
-        now[0] -= 3600 * S
-        camera.read()
-        camera.read()
-    assert max(waits, default=0.0) <= 1.0 / camera.config.rate_hz
+    bus, clock = clocked()
+    bus.add(ThetaCameraNode, ThetaCameraConfig(source="files", url=str(tmp_path)))
+    bus.advance(1.0)
+    before = len(bus.messages("/camera/image/compressed"))
+    clock.set_by_ns = -3600 * S
+    bus.advance_to(clock.steady_ns() + S)
+    assert before > 0 and len(bus.messages("/camera/image/compressed")) == 2 * before
 
 
 def test_images_and_the_button_count_from_their_publication() -> None:
