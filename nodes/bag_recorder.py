@@ -79,10 +79,7 @@ class BagRecorderNode(Node[BagRecorderConfig]):
         self.recorder.tick()
 
     def _snapshot(self, reason: str = "") -> dict[str, Any]:
-        try:
-            path = self.recorder.snapshot(reason, self.config.snapshot_after_s).path
-        except BagError as error:
-            raise NodeError(str(error)) from None
+        path = self.recorder.snapshot(reason, self.config.snapshot_after_s).path
         self.log.info("snapshot %s, with %g s more", path, self.config.snapshot_after_s)
         return {"path": str(path)}
 
@@ -101,7 +98,7 @@ class BagRecorderNode(Node[BagRecorderConfig]):
         if stopped and before is False:
             try:
                 self._snapshot("estop")
-            except (ValueError, NodeError) as error:
+            except ValueError as error:
                 self.log.error("no snapshot of the stop: %s", error)
 
     def teardown(self) -> None:

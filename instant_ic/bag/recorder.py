@@ -182,7 +182,6 @@ class Recorder:
 
         Raises:
             ValueError: not in snapshot mode, or no message has been received.
-            BagError: the bag cannot be created.
         """
         content = self._snapshot_cache().content()
         if not content:

@@ -66,7 +66,8 @@ class Recording:
     Args:
         path: folder of the bag, which must not exist.
         custom: returns the values to store with the bag, by name.
-        content: messages of the past, oldest first, with which the bag begins.
+        content: messages of the past, oldest first, with which the bag begins; its thread then creates the bag, and
+            :attr:`error` says if that fails.
         until_s: time at which the bag ends, by the monotonic clock; see :meth:`tick`.
         free_bytes: free space on the disk of a folder; replaced in tests.
 
@@ -95,7 +96,8 @@ class Recording:
         self._free_bytes = free_bytes
         self._until_s = until_s
         self._reserve = options.min_free_mb * _MB
-        self._writer = BagWriter(path, options.compressed, options.max_bag_size, options.max_bag_duration)
+        limits = (options.max_bag_size, options.max_bag_duration)
+        self._writer = BagWriter(path, options.compressed, *limits, create=not content)
         self._begun_s, self._ended_s = time.monotonic(), 0.0
         self._report = True
         self._begun_ns = min((message.stamp_ns for message in content), default=0)
@@ -218,6 +220,11 @@ class Recording:
     # -- the writing thread ------------------------------------------------------------------------
 
     def _run(self) -> None:
+        try:
+            if not self._writer.files:
+                self._writer.create()
+        except BagError as error:
+            self._fail(FAILED, str(error))
         now = time.monotonic()
         due_s = {"space": now, "flush": now, "custom": now + _KEEP_CUSTOM_S, "sync": now + SYNC_S}
         while True:

@@ -44,6 +44,7 @@ class BagWriter(Closing):
         compressed: compress chunks with zstd, for archiving or sending; halves the size of point packets.
         max_bytes: file size at which a new file starts; 0 sets no limit.
         max_duration_s: duration by message stamps after which a new file starts; 0 sets no limit.
+        create: call :meth:`create` at once; otherwise it must be called before anything else.
 
     Raises:
         DiskFullError: in all methods: the disk is full; lost messages are in ``lost``. The current file is given up at
@@ -57,6 +58,7 @@ class BagWriter(Closing):
         compressed: bool = False,
         max_bytes: int = 0,
         max_duration_s: float = 0.0,
+        create: bool = True,
     ) -> None:
         self.path = path
         self.compressed = compressed
@@ -72,12 +74,17 @@ class BagWriter(Closing):
         self._file: McapWriter | None = None
         self._opened = 0  # files, also those that were given up
         self._closed = False
+        if create:
+            self.create()
+
+    def create(self) -> None:
+        """Create the folder and the first file."""
         try:
-            make_folder(path)
+            make_folder(self.path)
         except FileExistsError:
-            raise BagError(f"bag {path} cannot be created: {path} already exists") from None
+            raise BagError(f"bag {self.path} cannot be created: {self.path} already exists") from None
         except OSError as error:
-            raise BagError(f"bag {path} cannot be created: {error.strerror or error}") from None
+            raise BagError(f"bag {self.path} cannot be created: {error.strerror or error}") from None
         self._file = self._open_file()
 
     @property

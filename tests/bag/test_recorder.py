@@ -286,6 +286,29 @@ def test_a_snapshot_ends_after_its_time_and_takes_more_than_the_queue_holds(tmp_
     assert [payload[0] for _, _, payload in read(snapshot.path)] == [1, 2, 3, 4] and not recorder.failed
 
 
+def test_a_snapshot_waits_for_no_disk_and_one_that_cannot_be_written_is_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    recorder, disk = recorder_of(tmp_path / "snaps", snapshot=True), SlowDisk(monkeypatch)
+    recorder.take("/scan", BOOL, b"1", 1 * S)
+    disk.hang()
+    first = recorder.snapshot("hanging")  # returns although not even its file can be begun
+    assert not first.done
+    disk.go.set()
+    wait_for(lambda: first.done, "the snapshot")
+    assert not first.error
+    monkeypatch.setattr("instant_ic.bag.writer.make_folder", refuse_folder)
+    second = recorder.snapshot("refused")
+    wait_for(lambda: second.done, "the refusal")
+    assert "cannot be created: Permission denied" in second.error and recorder.failed
+    with pytest.raises(BagError, match="Permission denied"):
+        recorder.close()
+
+
+def refuse_folder(path: Path) -> None:
+    raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
+
+
 def on_the_disk(path: Path) -> list[bytes]:
     """Payloads in all files of a bag, complete or not."""
     return [message.payload for file in path.glob("*.mcap") for message in McapScan(file).messages()]
