@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from instant_ic.vspace.keyframes import Keyframe
 from instant_ic.vspace.nerf.field import Floats, Rays
@@ -84,8 +83,3 @@ def dissolve(before: Floats, after: Floats, share: float) -> Floats:
     apart = cv2.blur(np.abs(change).max(axis=2), (AROUND_PIXELS, AROUND_PIXELS))
     kept = (1 - share) * np.clip((APART - apart) / (APART - ALIKE), 0, 1)
     return np.asarray(after - kept[..., None] * change, np.float32)
-
-
-def to_8bit(image: Floats) -> NDArray[np.uint8]:
-    """Convert an image of values 0 to 1 to 8 bit."""
-    return np.rint(np.clip(image, 0, 1) * np.float32(255)).astype(np.uint8)

@@ -22,7 +22,7 @@ from instant_ic.vspace.prior import KeyframeError, area_average, check_panorama,
 from instant_ic.vspace.readiness import UNSEEN_GAIN, Texture
 from instant_ic.vspace.space import SpaceState, SpaceStatus, VirtualSpace
 from instant_ic.vspace.texel_pyramids import TexelPyramids, texel_density
-from instant_ic.vspace.view import RayRenderer, View, continue_unseen, equirect_rays
+from instant_ic.vspace.view import RayRenderer, View, continue_unseen, equirect_rays, to_8bit
 
 EDGE_RATIO = 0.03
 """Neighbouring depths that differ by more than this share are an edge; its pixels are rendered by four rays."""
@@ -155,10 +155,9 @@ class MeshSpace(RayRenderer):
         colour, range_m, confidence = self._render_rays(rays)
         depth, confidence = range_m.reshape(height, width), confidence.reshape(height, width)
         image = continue_unseen(colour.reshape(height, width, 3), depth, confidence, wraps=projection == "equirect")
-        rgb = np.rint(np.clip(image, 0, 1) * np.float32(255)).astype(np.uint8)
         unseen = float(np.mean(confidence == 0))
         mse = (1 - unseen) * self._mse + UNSEEN_GAIN * unseen * self._variance
-        return View(rgb, depth, confidence, projection, psnr_of_mse(mse))
+        return View(to_8bit(image), depth, confidence, projection, psnr_of_mse(mse))
 
     def _render_rays(self, rays: Rays) -> tuple[Floats, Floats, Floats]:
         """Render rays; return colours (P, 3), 0 to 1, range (P,), 0 where nothing is met, and confidence (P,)."""

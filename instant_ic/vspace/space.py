@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from instant_ic.geometry.image_quality import psnr_of_mse
 from instant_ic.vspace.choice import Choice, WarpTrial, gain_db, trials
-from instant_ic.vspace.composition import ComposedView, Rendering, compose, dissolve, filled_image, to_8bit
+from instant_ic.vspace.composition import ComposedView, Rendering, compose, dissolve, filled_image
 from instant_ic.vspace.config import VirtualSpaceConfig
 from instant_ic.vspace.devices import cpu_device, is_out_of_memory, make_device
 from instant_ic.vspace.keyframes import Keyframe, KeyframeSet, extended
@@ -26,7 +26,7 @@ from instant_ic.vspace.nerf.occupancy import build_occupancy
 from instant_ic.vspace.prior import PanoramaPrior, prepare
 from instant_ic.vspace.readiness import error_terms, expected_psnr_db
 from instant_ic.vspace.saved import SavedSpace, TrainingProgress, read, write
-from instant_ic.vspace.view import RayRenderer, View
+from instant_ic.vspace.view import RayRenderer, View, to_8bit
 
 T = TypeVar("T")
 PROBE_COLUMNS = 64

@@ -162,6 +162,11 @@ def continue_unseen(image: Floats, depth_m: Floats, confidence: Floats, wraps: b
     return continue_unseen(image[:, around], depth_m[:, around], confidence[:, around])[:, side : side + width]
 
 
+def to_8bit(image: Floats) -> NDArray[np.uint8]:
+    """Convert an image of values 0 to 1 to 8 bit."""
+    return np.rint(np.clip(image, 0, 1) * np.float32(255)).astype(np.uint8)
+
+
 class RayRenderer(abc.ABC):
     """A space that is rendered ray by ray: its images in each projection."""
 

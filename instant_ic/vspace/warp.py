@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from instant_ic.geometry.projections import directions_at
 from instant_ic.vspace.nerf.field import Floats, Rays
 from instant_ic.vspace.prior import ROOM, PanoramaPrior, edge_quads
-from instant_ic.vspace.view import View, check_size, checked_pose, continue_unseen, perspective_rays
+from instant_ic.vspace.view import View, check_size, checked_pose, continue_unseen, perspective_rays, to_8bit
 
 EDGE_RATIO = 0.05
 """Neighbouring depths that differ by more than this share, off one plane, are an edge."""
@@ -136,8 +136,7 @@ class PanoramaWarp:
         colour, depth, confidence = self.render_rays(rays)
         depth, confidence = depth.reshape(height, width), confidence.reshape(height, width)
         image = continue_unseen(colour.reshape(height, width, 3), depth, confidence)
-        rgb = np.rint(np.clip(image, 0, 1) * np.float32(255)).astype(np.uint8)
-        return View(rgb, depth, confidence)
+        return View(to_8bit(image), depth, confidence)
 
     def render_rays(self, rays: Rays) -> tuple[Floats, Floats, Floats]:
         """Render the rays of a perspective view; return the same as ``field.Device.render_rays``.

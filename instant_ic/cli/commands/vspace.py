@@ -29,14 +29,6 @@ FEW_KNOWN = 0.1
 """A view with a smaller share of known pixels gives a warning."""
 
 
-def degrees(text: str) -> float:
-    """Parse a field of view."""
-    value = float(text)
-    if not 1 <= value <= 170:
-        raise argparse.ArgumentTypeError(f"must lie in 1..170 degrees (got {text})")
-    return value
-
-
 def add_parser(subparsers: Any) -> None:
     """Add the command and its verbs."""
     verbs = group(
@@ -84,7 +76,7 @@ def _add_render(verbs: Any) -> None:
     add = parser.add_argument
     add("space", type=Path, metavar="DIR", help="folder written by ic vspace train")
     add("--device", choices=DEVICES, help="(default: as in training)")
-    add("--fov", type=degrees, default=90.0, metavar="DEG", help="horizontal field of view (%(default)g degrees)")
+    add("--fov", type=positive, default=90.0, metavar="DEG", help="horizontal field of view (%(default)g degrees)")
     sizes = ", ".join(f"{name} {w}x{h}" for name, (w, h) in SIZES.items())
     add("--size", type=size, metavar="WxH", help=f"pixels (default: {sizes})")
     add("--pose", type=numbers("x,y,z,yaw"), default=[0.0, 0.0, 0.0, 0.0], metavar="x,y,z,yaw", help="(0,0,0,0)")
@@ -172,7 +164,7 @@ def render(args: argparse.Namespace) -> int:
         else:
             view = space.render_equirect(pose, width)
     except ValueError as error:
-        raise UserError(f"--size: {error}", 2) from error
+        raise UserError(f"--size, --fov: {error}", 2) from error
     write_image(args.out, view.rgb)
     if args.depth:
         write_depth(args.depth, view.depth_m)
