@@ -1,7 +1,6 @@
 """Backend, time-outs and tokens that the tests of the server over real sockets share."""
 
 import asyncio
-import threading
 
 from instant_ic.console import ConsoleBackend
 from instant_ic.console.drive import DriveConfig
@@ -26,43 +25,23 @@ class Backend(ConsoleBackend):
     def __init__(self):
         self.commands, self.estops, self.looks, self.operator, self.recorder = [], [], [], [], []
         self.released, self.watched = [], []
-        self._news = threading.Condition()
+        self.on_estop, self.on_look, self.on_operator = self.estops.append, self.looks.append, self.operator.append
+        self.on_released, self.on_watched = self.released.append, self.watched.append
 
     def on_drive(self, linear, angular):
-        self._add(self.commands, (linear, angular))
-
-    def on_operator(self, there):
-        self._add(self.operator, there)
-
-    def on_estop(self, stop):
-        self._add(self.estops, stop)
-
-    def on_look(self, look):
-        self._add(self.looks, look)
-
-    def on_released(self, client):
-        self._add(self.released, client)
-
-    def on_watched(self, watched):
-        self._add(self.watched, watched)
+        self.commands.append((linear, angular))
 
     def on_record(self, on):
-        self._add(self.recorder, ("record", on))
+        self.recorder.append(("record", on))
 
     def on_snapshot(self):
-        self._add(self.recorder, ("snapshot",))
+        self.recorder.append(("snapshot",))
 
     def on_bookmark(self):
-        self._add(self.recorder, ("bookmark",))
+        self.recorder.append(("bookmark",))
 
-    def _add(self, target, value):
-        with self._news:
-            target.append(value)
-            self._news.notify_all()
-
-    def wait(self, predicate):
-        with self._news:
-            assert self._news.wait_for(lambda: predicate(self), WAIT_S), (self.commands[-5:], self.estops, self.looks)
+    async def wait(self, predicate):
+        await until(lambda: predicate(self))
 
 
 def token_file(folder, name, token, mode=0o600):

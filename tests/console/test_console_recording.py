@@ -1,6 +1,5 @@
 """Record, snapshot, bookmark and export: what the recorder is asked, and what the page is told when it cannot."""
 
-import asyncio
 import queue
 import re
 import threading
@@ -133,7 +132,7 @@ async def test_drivers_record_and_watchers_may_not(serve, files):
         await driver.send({"type": "snapshot"})
         await driver.send({"type": "bookmark"})
         await driver.send({"type": "record", "on": False})
-        await asyncio.to_thread(server.backend.wait, lambda b: len(b.recorder) == 4)
+        await server.backend.wait(lambda b: len(b.recorder) == 4)
         assert server.backend.recorder == [("record", True), ("snapshot",), ("bookmark",), ("record", False)]
         for bad in ({"type": "record"}, {"type": "record", "on": 1}):
             await driver.send(bad)

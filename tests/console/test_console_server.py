@@ -27,10 +27,6 @@ def cut(client):
     client.socket.get_extra_info("socket").shutdown(socket.SHUT_RDWR)
 
 
-def in_thread(function, *args):
-    return asyncio.get_running_loop().run_in_executor(None, function, *args)
-
-
 async def test_the_first_page_and_the_end_of_the_last_are_reported(serve):
     server = serve()
     watched = server.backend.watched
@@ -53,10 +49,10 @@ async def test_fault_any_client_drives(serve):
         assert motion(server.backend) == [] and server.backend.looks == []
         await first.look(-0.5, 0.1)
         await first.send_drive(0.3, 0.1)
-        await in_thread(server.backend.wait, lambda b: (0.3, 0.1) in b.commands)
+        await server.backend.wait(lambda b: (0.3, 0.1) in b.commands)
         assert [(look.yaw, look.pitch) for look in server.backend.looks] == [(-0.5, 0.1)]
         await second.acquire(take=True)
-        await in_thread(server.backend.wait, lambda b: b.commands[-1] == (0.0, 0.0))
+        await server.backend.wait(lambda b: b.commands[-1] == (0.0, 0.0))
         await first.wait_for(lambda c: c.session["driver"] == "other", WAIT_S)
         await first.send_drive(0.3, 0.1)
         await first.wait_for(lambda c: c.refused == ["not_driver"], WAIT_S)
@@ -70,7 +66,7 @@ async def test_fault_robot_runs_its_last_command_when_its_page_falls_silent(serv
         await client.acquire()
         await client.send_drive(0.3, 0.0)  # one command, then none
         await until(lambda: server.drive.gate.watchdog_trips == 1)
-        await in_thread(server.backend.wait, lambda b: b.commands[-1] == (0.0, 0.0))
+        await server.backend.wait(lambda b: b.commands[-1] == (0.0, 0.0))
     assert (0.3, 0.0) in server.backend.commands
 
 
@@ -82,7 +78,7 @@ async def test_the_watchdog_follows_the_pace_of_a_simulation(serve):
         async with ConsoleClient(server.url) as client:
             await client.acquire()
             await client.send_drive(0.3, 0.0)
-            await in_thread(server.backend.wait, lambda b: (0.3, 0.0) in b.commands)
+            await server.backend.wait(lambda b: (0.3, 0.0) in b.commands)
             await asyncio.sleep(0.6)
             assert server.drive.gate.watchdog_trips == 0 and server.backend.commands[-1] == (0.3, 0.0)
     finally:
@@ -95,9 +91,9 @@ async def test_fault_socket_cut_leaves_the_throttle(serve):
     await client.connect()
     await client.acquire()
     await client.send_drive(0.3, 0.0)
-    await in_thread(server.backend.wait, lambda b: b.commands)
+    await server.backend.wait(lambda b: b.commands)
     cut(client)  # no closing handshake
-    await in_thread(server.backend.wait, lambda b: b.commands[-1] == (0.0, 0.0))
+    await server.backend.wait(lambda b: b.commands[-1] == (0.0, 0.0))
     await client.close()
 
 
@@ -113,20 +109,20 @@ async def test_the_loss_of_the_driver_is_told_at_once(serve, how):
     server = serve()
     async with ConsoleClient(server.url) as client:
         await client.acquire()
-        await in_thread(server.backend.wait, lambda b: b.operator[:1] == [True])
+        await server.backend.wait(lambda b: b.operator[:1] == [True])
         client.beats.cancel()  # the beats
-        await in_thread(server.backend.wait, lambda b: b.operator[-1] is False)
+        await server.backend.wait(lambda b: b.operator[-1] is False)
         if how != "silent":
             told = len(server.backend.operator)
             await client.send({"type": "ping", "client_ms": 0})
-            await in_thread(server.backend.wait, lambda b: len(b.operator) > told)
+            await server.backend.wait(lambda b: len(b.operator) > told)
         if how == "hidden":
             await client.send({"type": "ping", "client_ms": 0, "away": True})
         elif how == "given back":
             await client.send({"type": "yield"})
         elif how == "cut":
             cut(client)
-        await in_thread(server.backend.wait, lambda b: b.operator[-1] is False)
+        await server.backend.wait(lambda b: b.operator[-1] is False)
         await client.close()
     # Each turn once.
     assert server.backend.operator == [True, False] * (1 if how == "silent" else 2)
@@ -148,9 +144,9 @@ async def test_emergency_stop_from_a_watcher_is_latched_until_the_driver_release
     async with ConsoleClient(server.url) as driver, ConsoleClient(server.url) as watcher:
         await driver.acquire()
         await driver.send_drive(0.3, 0.0)
-        await in_thread(server.backend.wait, lambda b: b.commands)
+        await server.backend.wait(lambda b: b.commands)
         await watcher.estop()
-        await in_thread(server.backend.wait, lambda b: b.commands[-1] == (0.0, 0.0) and b.estops == [True])
+        await server.backend.wait(lambda b: b.commands[-1] == (0.0, 0.0) and b.estops == [True])
         await driver.wait_for(lambda c: c.session["estop"], WAIT_S)
         await driver.send_drive(0.3, 0.0)
         await driver.wait_for(lambda c: c.refused == ["stopped"], WAIT_S)
@@ -158,7 +154,7 @@ async def test_emergency_stop_from_a_watcher_is_latched_until_the_driver_release
         await watcher.wait_for(lambda c: c.refused == ["not_driver"], WAIT_S)
         assert server.backend.estops == [True]
         await driver.release_estop()
-        await in_thread(server.backend.wait, lambda b: b.estops == [True, False])
+        await server.backend.wait(lambda b: b.estops == [True, False])
     assert server.backend.commands.count((0.3, 0.0)) >= 1
 
 
@@ -167,7 +163,7 @@ async def test_a_page_shows_who_drives_the_robot_and_not_who_has_this_servers_le
     async with ConsoleClient(server.url) as client, ConsoleClient(server.url) as second:
         server.follow_robot("host_bridge/tablet/console/page 1 abc", False)
         await client.send({"type": "lease", "take": False})
-        await in_thread(server.backend.wait, lambda b: b.commands)  # zeros ask the robot for its lease
+        await server.backend.wait(lambda b: b.commands)  # zeros ask the robot for its lease
         name = server.drive.client
         other = ("other", "host_bridge/tablet/console")
         for one in (client, second):
@@ -201,7 +197,7 @@ async def test_a_page_shows_the_robots_emergency_stop_whoever_pressed_or_release
         server.follow_robot(f"console/{server.drive.client}", True)  # and pressed it
         await client.wait_for(lambda c: c.session["estop"], WAIT_S)
         await client.release_estop()
-        await in_thread(server.backend.wait, lambda b: b.estops == [True, False])
+        await server.backend.wait(lambda b: b.estops == [True, False])
         await client.send_drive(0.3, 0.0)
         await client.wait_for(lambda c: c.refused == ["stopped"], WAIT_S)  # the robot has not released it
         assert client.session["estop"]
@@ -328,8 +324,8 @@ async def test_end_of_the_server_stops_the_robot_and_closes_the_clients(serve):
     async with ConsoleClient(server.url) as client:
         await client.acquire()
         await client.send_drive(0.3, 0.0)
-        await in_thread(server.backend.wait, lambda b: b.commands)
-        await in_thread(server.stop)
+        await server.backend.wait(lambda b: b.commands)
+        await asyncio.to_thread(server.stop)
         with pytest.raises(ConnectionError):
             await client.wait_for(lambda c: False, WAIT_S)
     assert server.backend.commands[-1] == (0.0, 0.0)
