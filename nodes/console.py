@@ -141,16 +141,15 @@ class ConsoleNode(Node[ConsoleConfig], ConsoleBackend):
     def on_drawn(self) -> None:
         self.feed.report_shown()
 
-    def on_record(self, on: bool) -> None:
-        self.recording.record(on)
-
-    def on_snapshot(self) -> None:
-        self.recording.snapshot()
-
-    def on_bookmark(self) -> None:
-        name = f"bookmark {datetime.now():%H:%M:%S}"
-        self.bookmark_out.publish(msg.String(data=name))  # the topic puts it into every recording and snapshot
-        self.recording.bookmark(name)
+    def on_recorder(self, command: str, on: bool) -> None:
+        if command == "record":
+            self.recording.record(on)
+        elif command == "snapshot":
+            self.recording.snapshot()
+        else:
+            name = f"bookmark {datetime.now():%H:%M:%S}"
+            self.bookmark_out.publish(msg.String(data=name))  # the topic puts it into every recording and snapshot
+            self.recording.bookmark(name)
 
     def ask_recorder(self, command: str, **arguments: Any) -> Any:
         """Call the recorder node, on the desk's thread; raise RecorderError with a message for the operator."""

@@ -30,14 +30,8 @@ class ConsoleBackend:
     def on_look(self, look: Look) -> None:
         """Take the new look direction and field of view of the driver."""
 
-    def on_record(self, on: bool) -> None:
-        """Start or stop a recording."""
-
-    def on_snapshot(self) -> None:
-        """Save the last minute."""
-
-    def on_bookmark(self) -> None:
-        """Set a bookmark at the present moment."""
+    def on_recorder(self, command: str, on: bool) -> None:
+        """Start or stop a recording (``record``, ``on``), save the last minute (``snapshot``) or set a ``bookmark``."""
 
     def on_watched(self, watched: bool) -> None:
         """Note that the first page has come (True) or the last one has gone (False)."""

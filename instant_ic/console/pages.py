@@ -358,14 +358,8 @@ class Pages:
 
     def _on_recorder(self, session: PageSession, message: dict[str, Any], now: float) -> None:
         on = flag(message, "on", None if message["type"] == "record" else False)
-        if not _may_drive(session):
-            return
-        if message["type"] == "record":
-            self._backend.on_record(on)
-        elif message["type"] == "snapshot":
-            self._backend.on_snapshot()
-        else:
-            self._backend.on_bookmark()
+        if _may_drive(session):
+            self._backend.on_recorder(message["type"], on)
 
     def _on_ack(self, session: PageSession, message: dict[str, Any], now: float) -> None:
         try:

@@ -107,14 +107,11 @@ class Demo(ConsoleBackend):
     def on_look(self, look: Look) -> None:
         self.look = look
 
-    def on_record(self, on: bool) -> None:
-        self._desk.record(on)
-
-    def on_snapshot(self) -> None:
-        self._desk.snapshot()
-
-    def on_bookmark(self) -> None:
-        self._desk.bookmark("bookmark 12:00:00")
+    def on_recorder(self, command: str, on: bool) -> None:
+        if command == "record":
+            self._desk.record(on)
+        elif command == "snapshot":
+            self._desk.snapshot()
 
     def start(self) -> None:
         """Start the server and the robot."""

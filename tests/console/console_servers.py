@@ -31,14 +31,8 @@ class Backend(ConsoleBackend):
     def on_drive(self, linear, angular):
         self.commands.append((linear, angular))
 
-    def on_record(self, on):
-        self.recorder.append(("record", on))
-
-    def on_snapshot(self):
-        self.recorder.append(("snapshot",))
-
-    def on_bookmark(self):
-        self.recorder.append(("bookmark",))
+    def on_recorder(self, command, on):
+        self.recorder.append((command, on))
 
     async def wait(self, predicate):
         await until(lambda: predicate(self))

@@ -85,7 +85,7 @@ def node():
 
 def test_a_bookmark_goes_to_the_bus_so_that_every_bag_has_it(node):
     bus, console = node
-    console.on_bookmark()
+    console.on_recorder("bookmark", False)
     assert re.fullmatch(r"bookmark \d\d:\d\d:\d\d", bus.last("/operator/bookmark").data)
 
 
@@ -133,7 +133,12 @@ async def test_drivers_record_and_watchers_may_not(serve, files):
         await driver.send({"type": "bookmark"})
         await driver.send({"type": "record", "on": False})
         await server.backend.wait(lambda b: len(b.recorder) == 4)
-        assert server.backend.recorder == [("record", True), ("snapshot",), ("bookmark",), ("record", False)]
+        assert server.backend.recorder == [
+            ("record", True),
+            ("snapshot", False),
+            ("bookmark", False),
+            ("record", False),
+        ]
         for bad in ({"type": "record"}, {"type": "record", "on": 1}):
             await driver.send(bad)
         await driver.wait_for(lambda c: len(c.errors) == 2, WAIT_S)
