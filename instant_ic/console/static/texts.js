@@ -57,7 +57,7 @@ export function vspaceText(vspace) {
     case "ready": return "Virtual space ready";
     case "training": return `Virtual space training, ${vspace.train_seconds.toFixed(0)} s`;
     case "failed": return `Virtual space failed: ${vspace.message}`;
-    default: return vspace?.message || "No virtual space yet";
+    default: return sentence(vspace?.message) || "No virtual space yet";
   }
 }
 
