@@ -21,6 +21,7 @@ _COLOURS = ("cyan", "green", "magenta", "yellow", "blue", "bright_cyan", "bright
 _LINE_STYLES = {" WARNING ": "yellow", " ERROR ": "red", " CRITICAL ": "bold red"}
 _LOGGED = re.compile(r"\d{4}-\d\d-\d\d (\d\d:\d\d:\d\d\.\d{3} ([A-Z]+) +(.*))")
 """A line that a node logs: date, time, level, text."""
+_TABLE_S = 0.5
 _HOLDS_BACK_S = 30.0
 """Warnings wait for "ready" for this long, since most of a start's end with it."""
 
@@ -77,6 +78,7 @@ class StackScreen:
         self._progress_period_s = progress_period_s
         self._started_s = time.monotonic()
         self._next_progress_s = self._started_s + progress_period_s
+        self._next_table_s = self._started_s
         self._all_up = self._ready = False
         self._addresses: dict[str, str] = {}
         self._reported_faults: tuple[str, ...] = ()
@@ -134,7 +136,8 @@ class StackScreen:
         now = time.monotonic()
         if view.looked and not view.ending:
             self._report_progress(view, now)
-        if self._live is not None:
+        if self._live is not None and (now >= self._next_table_s or view.ending):
+            self._next_table_s = now + _TABLE_S
             self._live.update(self.table(view), refresh=True)
 
     def _report_progress(self, view: StackView, now: float) -> None:
