@@ -89,16 +89,10 @@ class StackOutput:
         self._screen = StackScreen(labels, live, verbose=verbose)
         self._outlet = Outlet(_WAITING_LINES)
         self._outlet.put(self._screen.start, always=True)
-        self._dropped_lines = 0
 
     def node_line(self, node: str, text: str) -> None:
-        """Show a line of a node, unless the terminal lags too far behind."""
-        if self._dropped_lines and self._outlet.put(
-            self._screen.event, f"{self._dropped_lines} lines dropped: see the logs"
-        ):
-            self._dropped_lines = 0
-        if not self._outlet.put(self._screen.node_line, node, text):
-            self._dropped_lines += 1
+        """Show a line of a node, unless the terminal lags too far behind; the log has it."""
+        self._outlet.put(self._screen.node_line, node, text)
 
     def event(self, text: str, bad: bool = False) -> None:
         """Show an event of the launcher."""
