@@ -23,7 +23,7 @@ class ArbiterNode(Node[ArbiterConfig]):
     """Connects ``Arbiter`` and ``Surroundings`` to topics."""
 
     name = "arbiter"
-    live_parameters = (*("limits", "prediction", "collision_monitor", "passage", "planner", "switch", "timeouts"),)
+    live_parameters = (*("limits", "prediction", "collision_monitor", "passage", "switch", "timeouts"),)
 
     def setup(self) -> None:
         c = self.config

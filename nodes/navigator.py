@@ -15,7 +15,7 @@ from instant_ic.control.follower import FollowerConfig, PathFollower
 from instant_ic.control.footprint import Footprint
 from instant_ic.control.kinematics import MotionLimits, extrapolate
 from instant_ic.control.navigator import Navigator, moving_subgoal
-from instant_ic.control.planner import HybridPlanner, PlannerConfig
+from instant_ic.control.planner import HybridPlanner
 from instant_ic.control.states import Mode
 from instant_ic.control.warmup import warm_up
 from instant_ic.util.step_gap import StepGap
@@ -40,7 +40,6 @@ class NavigatorConfig(Checked):
     state_timeout_s: Annotated[float, Plausible(0.05, 2)] = 0.3
     limits: MotionLimits = field(default_factory=MotionLimits)
     footprint: Footprint = field(default_factory=Footprint)
-    planner: PlannerConfig = field(default_factory=PlannerConfig)
     follower: FollowerConfig = field(default_factory=FollowerConfig)
 
 
@@ -53,7 +52,7 @@ class NavigatorNode(Node[NavigatorConfig]):
 
     name = "navigator"
 
-    live_parameters = ("replan_period_s", "limits", "planner", "follower")
+    live_parameters = ("replan_period_s", "limits", "follower")
 
     def setup(self) -> None:
         if not self.lockstep:
@@ -74,7 +73,7 @@ class NavigatorNode(Node[NavigatorConfig]):
 
     def made(self, c: NavigatorConfig) -> Navigator:
         follower = PathFollower(c.follower, c.limits, c.footprint)
-        return Navigator(HybridPlanner(c.planner, c.footprint), follower, c.replan_period_s)
+        return Navigator(HybridPlanner(c.footprint), follower, c.replan_period_s)
 
     def reconfigure(self, config: NavigatorConfig) -> None:
         super().reconfigure(config)

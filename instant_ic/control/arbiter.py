@@ -118,7 +118,7 @@ class Arbiter:
         # From here on nothing fails: unusable values have raised above.
         self.config, self.predictor, self.rules = config, predictor, rules
         self._sources = SourceMonitor(config)
-        self._planner = HybridPlanner(config.planner, config.footprint)
+        self._planner = HybridPlanner(config.footprint)
 
     def step(self, inputs: ArbiterInputs, now_ns: int) -> Decision:
         """Take at most one transition, then return the command of the resulting state."""

@@ -11,7 +11,6 @@ from instant_ic.control.footprint import Footprint
 from instant_ic.control.freshness import TimeoutConfig
 from instant_ic.control.kinematics import MotionLimits
 from instant_ic.control.passage import PassageConfig
-from instant_ic.control.planner import PlannerConfig
 from instant_ic.control.prediction import PredictionConfig, stopping_distance
 from instant_ic.control.safety import CollisionMonitorConfig
 
@@ -100,7 +99,6 @@ class ArbiterConfig(Checked):
 
     Attributes:
         collision_monitor: last step before /cmd_vel; the most restrictive polygon wins.
-        planner: finds out whether there is a way round the obstacle; the navigator has its own.
         timeouts: s; with an older message the command is zero. Images (camera, view): late_s after their usual arrival,
             if longer.
         rate_hz: steps of the state machine and messages on /cmd_vel, per second; while the robot rests, at most 10.
@@ -113,7 +111,6 @@ class ArbiterConfig(Checked):
     prediction: PredictionConfig = field(default_factory=PredictionConfig)
     collision_monitor: CollisionMonitorConfig = field(default_factory=CollisionMonitorConfig)
     passage: PassageConfig = field(default_factory=PassageConfig)
-    planner: PlannerConfig = field(default_factory=PlannerConfig)
     switch: SwitchConfig = field(default_factory=SwitchConfig)
     timeouts: TimeoutConfig = field(default_factory=TimeoutConfig)
     pose_trust: PoseTrustConfig = field(default_factory=PoseTrustConfig)

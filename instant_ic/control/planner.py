@@ -23,7 +23,6 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from instant_ic.config.ranges import Checked, NotNegative, PositiveInt
 from instant_ic.control.costmap import INSCRIBED, LETHAL, UNKNOWN, Costmap
 from instant_ic.control.footprint import Footprint
 from instant_ic.control.hybrid_astar import (
@@ -49,6 +48,7 @@ class PlannerTuning:
     """Tuning of the search. Penalties are factors or metres of extra way, so that prices compare as lengths.
 
     Attributes:
+        footprint_padding: padding of the footprint, in metres.
         cost_penalty: extra price of a metre at cost 252; higher: longer paths, farther from obstacles.
         tight_cost: cost above which the robot cannot turn on the spot (0.39 m from obstacles).
         tight_penalty: further price of a metre above that, at cost 252.
@@ -66,6 +66,7 @@ class PlannerTuning:
             come sooner.
     """
 
+    footprint_padding: float = 0.02
     cost_penalty: float = 3.0
     tight_cost: int = 165
     tight_penalty: float = 6.0
@@ -83,19 +84,6 @@ class PlannerTuning:
 
 
 TUNING = PlannerTuning()
-
-
-@dataclass(frozen=True)
-class PlannerConfig(Checked):
-    """Limits of the planner, with the names of nav2's Smac planner.
-
-    Attributes:
-        footprint_padding: m round the footprint.
-        max_iterations: poses after which the search gives up.
-    """
-
-    footprint_padding: NotNegative = 0.02
-    max_iterations: PositiveInt = 5000
 
 
 @dataclass(frozen=True)
@@ -132,9 +120,9 @@ class HybridPlanner:
     `PlannerTuning`.)
     """
 
-    def __init__(self, config: PlannerConfig, footprint: Footprint | None = None) -> None:
-        self.config = config
-        self.footprint = footprint or Footprint()
+    def __init__(self, footprint: Footprint | None = None, max_iterations: int = 5000) -> None:
+        """Plan for a footprint; a search gives up after ``max_iterations`` poses."""
+        self.footprint, self.max_iterations = footprint or Footprint(), max_iterations
 
     def plan(
         self,
@@ -189,7 +177,7 @@ class HybridPlanner:
         """Return why a path ends ``gap_m`` metres before the goal."""
         if outside:
             return f"the goal is outside the costmap, {gap_m:.1f} m beyond the path"
-        if reachable and opened >= self.config.max_iterations:
+        if reachable and opened >= self.max_iterations:
             return f"no way found within {opened} steps of the search; the path ends {gap_m:.1f} m before the goal"
         if reachable:
             return f"no way to the goal: it is too narrow for the robot {gap_m:.1f} m before it"
@@ -221,8 +209,7 @@ class _PlannerGrid:
     def __init__(self, planner: HybridPlanner, costmap: Costmap, before: Plan | None) -> None:
         import cv2
 
-        config = planner.config
-        self.planner, self.config, self.costmap = planner, config, costmap
+        self.planner, self.costmap = planner, costmap
         free = (costmap.costs != LETHAL).astype(np.uint8)
         if free.all():
             self.clearance = np.full(free.shape, 1e6, dtype=np.float32)
@@ -238,13 +225,13 @@ class _PlannerGrid:
         self.weights = cell_weights(costmap.costs, near, unknown, TUNING.cost_penalty, tight, TUNING.retrospective_gain)
         # The body in cells at each heading, filled: posts inside the outline count too. At a spacing of 0.7 cells
         # every cell whose middle is covered holds a point.
-        body = planner.footprint.points(0.7 * costmap.resolution, config.footprint_padding) / costmap.resolution
+        body = planner.footprint.points(0.7 * costmap.resolution, TUNING.footprint_padding) / costmap.resolution
         body = body[np.argsort(-(body**2).sum(axis=1), kind="stable")]
         yaw = 2.0 * math.pi * np.arange(BINS) / BINS
         c, s = np.cos(yaw)[:, None], np.sin(yaw)[:, None]
         bodies = np.stack([c * body[:, 0] - s * body[:, 1], s * body[:, 0] + c * body[:, 1]], axis=-1)
         # A pose may lie anywhere in its cell: nothing can touch from 0.71 cells farther on.
-        reach = planner.footprint.circumscribed_radius_m + 1.5 * config.footprint_padding
+        reach = planner.footprint.circumscribed_radius_m + 1.5 * TUNING.footprint_padding
         reach = reach / costmap.resolution + 1.42
         self.map = GridMap(costmap.costs, self.weights, self.clearance, np.ascontiguousarray(body), bodies, reach)
 
@@ -276,7 +263,7 @@ class _PlannerGrid:
         That is the start where none is nearer.
         """
         half = 0.5 * max(self.planner.footprint.length_m, self.planner.footprint.width_m)
-        room = (half + self.config.footprint_padding) / self.costmap.resolution + 0.5
+        room = (half + TUNING.footprint_padding) / self.costmap.resolution + 0.5
         rows, columns = np.nonzero(connected & (self.costmap.costs < INSCRIBED) & (self.clearance > room))
         if rows.size == 0:
             return start
@@ -297,7 +284,7 @@ class _PlannerGrid:
             self.costmap.costs, self.weights, near, (row, column), escape, TUNING.least_weight, TUNING.closed_weight
         )
         rules = SearchRules(
-            max_iterations=self.config.max_iterations,
+            max_iterations=self.planner.max_iterations,
             escape=escape,
             change_price=TUNING.change_penalty_m / resolution,
             turn_price=TUNING.rotation_penalty_m / resolution,

@@ -10,7 +10,7 @@ from instant_ic.control.costmap import CostmapConfig, RollingCostmap, scan_rays
 from instant_ic.control.footprint import Footprint
 from instant_ic.control.heights import sort_points
 from instant_ic.control.kinematics import MotionLimits
-from instant_ic.control.planner import HybridPlanner, PlannerConfig
+from instant_ic.control.planner import HybridPlanner
 from instant_ic.control.prediction import PredictionConfig, Predictor
 from instant_ic.control.safety import CollisionMonitor, CollisionMonitorConfig
 from instant_ic.util.jit import leave_out_blas
@@ -28,5 +28,5 @@ def warm_up() -> None:
     sweep = sort_points(points, np.zeros(6, dtype=np.float32), mount[None], 0.0, config.points)
     costmap = RollingCostmap(config, footprint).update(np.zeros(3), None, rays, sweep)
     Predictor(PredictionConfig(), MotionLimits(), footprint).predict(np.zeros(3), (0.0, 0.0), (0.4, 0.0), costmap)
-    HybridPlanner(PlannerConfig(), footprint).plan(costmap, np.zeros(3), np.array([0.5, 0.5, 0.0]))
+    HybridPlanner(footprint).plan(costmap, np.zeros(3), np.array([0.5, 0.5, 0.0]))
     CollisionMonitor(CollisionMonitorConfig(), footprint).limit((0.4, 0.0), np.array([[0.5, 0.0], [0.5, 0.1]]))

@@ -29,7 +29,7 @@ from instant_ic.control.kinematics import MotionLimits, accelerate
 from instant_ic.control.moving import MovingPoints, MovingThings
 from instant_ic.control.navigator import Navigator
 from instant_ic.control.passage import PassageConfig
-from instant_ic.control.planner import HybridPlanner, Plan, PlannerConfig
+from instant_ic.control.planner import HybridPlanner, Plan
 from instant_ic.control.prediction import PredictionConfig, Predictor
 from instant_ic.control.safety import CollisionMonitor, CollisionMonitorConfig, MonitoredCommand
 from instant_ic.control.subgoal import choose_subgoal
@@ -86,7 +86,7 @@ class _TimedPlanner(HybridPlanner):
     """Records the CPU time of each plan."""
 
     def __init__(self) -> None:
-        super().__init__(PlannerConfig(), Footprint())
+        super().__init__(Footprint())
         self.spent_ms: list[float] = []
 
     def plan(self, costmap: Costmap, start: FloatArray, goal: FloatArray, before: Plan | None = None) -> Plan:

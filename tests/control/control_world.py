@@ -19,7 +19,7 @@ from instant_ic.control.follower import FollowerConfig, PathFollower
 from instant_ic.control.footprint import Footprint
 from instant_ic.control.kinematics import MotionLimits
 from instant_ic.control.navigator import Navigator, meeting_pose
-from instant_ic.control.planner import HybridPlanner, PlannerConfig
+from instant_ic.control.planner import HybridPlanner
 from instant_ic.control.snapshot import ArbiterInputs, Vspace
 from instant_ic.control.states import Mode, VbotAction
 from instant_ic.control.vbot import VbotConfig, VirtualRobot
@@ -182,7 +182,7 @@ class Loop:
         self.costmap_config = CostmapConfig()
         self.arbiter = Arbiter(config)
         limits = MotionLimits()
-        self.navigator = Navigator(HybridPlanner(PlannerConfig()), PathFollower(FollowerConfig(), limits))
+        self.navigator = Navigator(HybridPlanner(), PathFollower(FollowerConfig(), limits))
         self.vbot = VirtualRobot(VbotConfig(), limits)
         self.base = Base(np.array(start))
         self.pose_lost = 0.0

@@ -202,7 +202,7 @@ class TestGhosts:
     def test_ghosts_beside_an_obstacle_close_the_way_round_only_for_a_while(self) -> None:
         """A map with two walls that are not there, from scans put in the wrong place on a busy machine."""
         from instant_ic.control.passage import PassageConfig, find_passage
-        from instant_ic.control.planner import HybridPlanner, PlannerConfig
+        from instant_ic.control.planner import HybridPlanner
         from instant_ic.control.prediction import PredictionConfig, Predictor
         from instant_ic.control.states import Reason
 
@@ -220,7 +220,7 @@ class TestGhosts:
             costmap = rolling.update(robot, static, rays)
             if k in (0, config.static_seen_through):
                 ahead = predictor.predict(robot, forward, forward, costmap)
-                planner = HybridPlanner(PlannerConfig())
+                planner = HybridPlanner()
                 reasons.append(find_passage(costmap, ahead, True, None, planner, PassageConfig()))
         assert reasons[0].reason == Reason.NO_WAY_ROUND
         assert "(no way to the goal: " in reasons[0].text

@@ -21,13 +21,13 @@ from instant_ic.control.follower import FollowerConfig, PathFollower
 from instant_ic.control.footprint import Footprint
 from instant_ic.control.kinematics import MotionLimits
 from instant_ic.control.navigator import Navigator
-from instant_ic.control.planner import HybridPlanner, Plan, PlannerConfig
+from instant_ic.control.planner import HybridPlanner, Plan
 from instant_ic.control.prediction import PredictionConfig, Predictor
 from instant_ic.control.subgoal import choose_subgoal
 from instant_ic.control.walls import WallMap
 
 PREDICTOR = Predictor(PredictionConfig(), MotionLimits(), Footprint())
-PLANNER = HybridPlanner(PlannerConfig())
+PLANNER = HybridPlanner()
 
 
 def costmap_of(segments: np.ndarray, at: tuple[float, float] = (0.0, 0.0)) -> Costmap:

@@ -11,11 +11,11 @@ from instant_ic.control.costmap import LETHAL, UNKNOWN, Costmap, CostmapConfig, 
 from instant_ic.control.follower import FollowerConfig, PathFollower
 from instant_ic.control.footprint import Footprint
 from instant_ic.control.kinematics import MotionLimits
-from instant_ic.control.planner import HybridPlanner, Plan, PlannerConfig
+from instant_ic.control.planner import HybridPlanner, Plan
 from instant_ic.control.walls import StaticMap
 
 CELL = 0.05
-PLANNER = HybridPlanner(PlannerConfig())
+PLANNER = HybridPlanner()
 
 
 def room(*boxes: tuple[float, float, float, float], size: float = 8.0, unknown: tuple[float, ...] = ()) -> Costmap:
@@ -40,7 +40,7 @@ def touches(costmap: Costmap, pose: np.ndarray, padding: float = 0.0) -> bool:
 
 
 def plan(costmap: Costmap, start: tuple[float, ...], goal: tuple[float, ...], **values: object) -> Plan:
-    planner = HybridPlanner(PlannerConfig(**values)) if values else PLANNER  # type: ignore[arg-type]
+    planner = HybridPlanner(**values) if values else PLANNER  # type: ignore[arg-type]
     return planner.plan(costmap, np.array(start, float), np.array(goal, float))
 
 

@@ -17,7 +17,7 @@ from instant_ic.control.follower import FollowerConfig, PathFollower
 from instant_ic.control.footprint import Footprint
 from instant_ic.control.kinematics import accelerate, extrapolate
 from instant_ic.control.navigator import Navigator, meeting_pose
-from instant_ic.control.planner import HybridPlanner, PlannerConfig
+from instant_ic.control.planner import HybridPlanner
 from instant_ic.control.robot_lease import Verdict
 from instant_ic.control.safety import CollisionMonitor, CollisionMonitorConfig
 from instant_ic.control.vbot import VbotConfig, VirtualRobot
@@ -80,7 +80,7 @@ def test_a_pose_is_not_moved_on_by_what_is_no_number(odd: float) -> None:
 def test_fault_a_navigator_recovers_from_a_place_that_is_no_number(odd: float) -> None:
     """It takes a robot that never comes nearer for one that is stuck, and backs."""
     for wrong in spoilt((0.0, 0.0, 0.0, 0.2, 1.0, 0.0, 0.0, 0.1, 0.1), odd):
-        navigator = Navigator(HybridPlanner(PlannerConfig()), PathFollower(FollowerConfig(), LIMITS))
+        navigator = Navigator(HybridPlanner(), PathFollower(FollowerConfig(), LIMITS))
         for second in range(6):
             pose, speed, subgoal, velocity = wrong[:3], float(wrong[3]), wrong[4:7], (wrong[7], wrong[8])
             step = navigator.step(pose, speed, subgoal, FREE, second * 10**9, velocity)
