@@ -123,14 +123,8 @@ def relation_error(trajectory: FloatArray, relations: Relations) -> dict[str, fl
 
 
 def log_error(entries: Sequence[LogEntry], poses: FloatArray, relations: Relations) -> dict[str, float | int]:
-    """Return ``relation_error`` of the poses (n, 3) of a log's scans.
-
-    A log may have two clocks. The one that matches more relations counts.
-    """
+    """Return ``relation_error`` of the poses (n, 3) of a log's scans."""
     times = np.array([entry.scan.stamp_ns * 1e-9 for entry in entries])
-    logger = np.array([np.nan if entry.logger_s is None else entry.logger_s for entry in entries])
-    if np.isfinite(logger).all() and len(relations.at_stamps(logger)) > len(relations.at_stamps(times)):
-        times = logger
     order = np.argsort(times, kind="stable")
     return relation_error(np.column_stack([times, poses])[order], relations)
 

@@ -42,13 +42,11 @@ class LogEntry:
         scan: ranges by REP-117.
         odom_pose: odom_from_base (3,); None if the log has no odometry.
         base_from_laser: (3,).
-        logger_s: logger time of the scan in seconds, if the log has a second time column.
     """
 
     scan: Scan
     odom_pose: FloatArray | None
     base_from_laser: FloatArray
-    logger_s: float | None = None
 
 
 class _Lines(io.TextIOWrapper):
@@ -249,14 +247,6 @@ def _stamp_ns(text: str) -> int:
     raise ValueError(f"time stamp {text[:40]!r} is not a decimal number below {_MOST_STAMP_S} s")
 
 
-def _second_stamp(fields: list[str]) -> float | None:
-    """Return the logger time, if the line has one."""
-    try:
-        return float(fields[0])
-    except (IndexError, ValueError):
-        return None
-
-
 def _no_return(ranges: FloatArray, range_max: float) -> FloatArray:
     return np.where(ranges >= range_max, np.inf, ranges)
 
@@ -281,7 +271,7 @@ def _flaser(fields: list[str], survey: _Survey) -> LogEntry:
     # 180 of 181 beams: the last one, at +90°, is missing. The same holds for the other even numbers.
     angle_min = -increment * (count // 2) if count in _FLASER_INCREMENT_DEG else -math.pi / 2
     scan = Scan(_no_return(ranges, survey.range_max), angle_min, increment, 0.02, survey.range_max, _stamp_ns(tail[6]))
-    return _entry(scan, poses, survey, tail[8:])
+    return _entry(scan, poses, survey)
 
 
 def _robotlaser(fields: list[str], survey: _Survey) -> LogEntry:
@@ -296,12 +286,12 @@ def _robotlaser(fields: list[str], survey: _Survey) -> LogEntry:
         raise ValueError(f"expected poses, speeds and a time after the readings, found {len(tail)} fields")
     poses = _numbers(tail, "pose values", 6)
     scan = Scan(_no_return(ranges, range_max), start, increment, 0.02, range_max, _stamp_ns(tail[11]))
-    return _entry(scan, poses, survey, tail[13:])
+    return _entry(scan, poses, survey)
 
 
-def _entry(scan: Scan, poses: FloatArray, survey: _Survey, rest: list[str]) -> LogEntry:
+def _entry(scan: Scan, poses: FloatArray, survey: _Survey) -> LogEntry:
     odometry = None if survey.odometry is None else poses[survey.odometry]
-    return LogEntry(scan, odometry, survey.mount, _second_stamp(rest))
+    return LogEntry(scan, odometry, survey.mount)
 
 
 _MINES_FIRST_RANGE = 24
