@@ -5,7 +5,7 @@
     python benchmarks/slam.py --only faults --log NAME [--first N] [--faults NAME ...] [--places N]
 
 Parts: ``long`` (720 beams in a room for a long time, to see whether the cost per scan grows), ``intel``,
-``intel_seeds`` (five seeds of degraded odometry), ``worlds``, and, only if named, ``faults`` (put into one log).
+``worlds``, and, only if named, ``faults`` (put into one log).
 All use the default parameters. ``ic evaluate slam-sim`` measures the simulated crawler.
 """
 
@@ -13,8 +13,6 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Iterable, Iterator
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -23,7 +21,6 @@ from slam_faults import FAULTS, evaluate_faults
 from slam_worlds import LASERS, cells, drive, ring
 
 from instant_ic.experiments.slam import (
-    Relations,
     evaluate_log,
     read_relations,
     read_stamps,
@@ -31,7 +28,7 @@ from instant_ic.experiments.slam import (
 )
 from instant_ic.experiments.slam_logs import LogEntry, is_bag, read_bag, read_log
 from instant_ic.experiments.slam_sim import round_trip
-from instant_ic.geometry.poses import compose2, relative2
+from instant_ic.geometry.poses import compose2
 from instant_ic.sim.worlds import make_world
 from instant_ic.slam import GridSlam, Scan
 from instant_ic.slam.scan import FloatArray
@@ -88,37 +85,6 @@ def ranges_to_walls(pose: FloatArray) -> FloatArray:
     return np.minimum(along_x, along_y)
 
 
-def perturb_odometry(entries: Iterable[LogEntry], seed: int) -> Iterator[LogEntry]:
-    """Degrade a log's odometry: Gaussian noise of 5 % of each step's size, plus a scale error of 2 %.
-
-    Translation and rotation are each too long or too short; the seed decides which.
-    """
-    rng = np.random.default_rng(seed)
-    signs = rng.choice([-1.0, 1.0], 2)
-    factor = 1.0 + 0.02 * np.array([signs[0], signs[0], signs[1]])
-    last: FloatArray | None = None
-    pose = np.zeros(3)
-    for entry in entries:
-        if entry.odom_pose is None:
-            yield entry
-            continue
-        if last is None:
-            pose = entry.odom_pose
-        else:
-            step = relative2(last, entry.odom_pose)
-            size = np.array([math.hypot(step[0], step[1])] * 2 + [abs(step[2])])
-            pose = compose2(pose, factor * step + 0.05 * size * rng.standard_normal(3))
-        last = entry.odom_pose
-        yield replace(entry, odom_pose=pose)
-
-
-def intel(entries: list[LogEntry], relations: Relations, seed: int | None = None) -> dict[str, object]:
-    """Evaluate the Intel log; ``seed`` degrades its odometry."""
-    source = entries if seed is None else perturb_odometry(entries, seed)
-    report, _ = evaluate_log(source, relations)
-    return {key: report[key] for key in KEPT if key in report}
-
-
 def worlds() -> dict[str, object]:
     """Drive through generated buildings; return the errors of the online and of the final poses."""
     out: dict[str, object] = {}
@@ -154,7 +120,7 @@ def named_log(name: str, data: Path) -> list[LogEntry]:
 
 
 def main() -> None:
-    parts = ("long", "intel", "intel_seeds", "worlds")
+    parts = ("long", "intel", "worlds")
     parser = parser_for(__doc__)
     default = Path(__file__).resolve().parents[2] / "shared" / "data" / "slam2d"
     parser.add_argument("--data", type=Path, default=default, help="folder of the logs (default ../shared/data/slam2d)")
@@ -177,14 +143,11 @@ def main() -> None:
         result[args.log] = evaluate_faults(log, places=args.places, seed=args.seed, faults=args.faults, on_step=note)
     if "long" in args.only:
         result["long"] = room_drive(12000)
-    if {"intel", "intel_seeds"} & set(args.only):
-        entries = named_log("intel.log.gz", args.data)
+    if "intel" in args.only:
         stamps = read_stamps(args.data / "intel.exact_stamps")
         relations = read_relations(args.data / "intel.relations").at_stamps(stamps)
-        if "intel" in args.only:
-            result["intel"] = intel(entries, relations)
-        if "intel_seeds" in args.only:
-            result["intel_seeds"] = [intel(entries, relations, seed) for seed in range(1, 6)]
+        found, _ = evaluate_log(named_log("intel.log.gz", args.data), relations)
+        result["intel"] = {key: found[key] for key in KEPT if key in found}
     if "worlds" in args.only:
         result["worlds"] = worlds()
     report(result, args.json)
