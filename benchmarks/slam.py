@@ -4,9 +4,9 @@
     python benchmarks/slam.py [--data FOLDER] [--only NAME ...]
     python benchmarks/slam.py --only faults --log NAME [--first N] [--faults NAME ...] [--places N]
 
-Parts: ``long`` (720 beams in a room for a long time, to see whether the cost per scan grows), ``intel``,
-``worlds``, and, only if named, ``faults`` (put into one log).
-All use the default parameters. ``ic evaluate slam-sim`` measures the simulated crawler.
+Parts: ``long`` (720 beams in a room for a long time, to see whether the cost per scan grows), ``intel``, ``worlds``;
+``faults`` (put into one log) only if named. All use the default parameters. ``ic evaluate slam-sim`` measures the
+simulated crawler.
 """
 
 from __future__ import annotations

@@ -9,7 +9,7 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
@@ -69,14 +69,9 @@ def _observer(run_dir: Path) -> StackObserver:
     return StackObserver(_NoParameters(), LocalTransport(run_dir, StackObserver.name, clock.now_ns), clock)
 
 
-@contextlib.contextmanager
-def observer(run_dir: Path) -> Iterator[StackObserver]:
+def observer(run_dir: Path) -> contextlib.AbstractContextManager[StackObserver]:
     """Observe another run directory, such as that of a fleet's robot."""
-    watching = _observer(run_dir)
-    try:
-        yield watching
-    finally:
-        watching.close()
+    return contextlib.closing(_observer(run_dir))
 
 
 class Stack:

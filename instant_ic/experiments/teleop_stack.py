@@ -46,6 +46,7 @@ from instant_ic.msg import (
     stamp_ns,
     to_time,
 )
+from instant_ic.util.closing import Closing
 
 if TYPE_CHECKING:
     from instant_ic.sim.roboclaw_emulator import RoboclawEmulator
@@ -159,7 +160,7 @@ class _Page(PageServer):
             self._stack.on_frame(kind is FrameKind.VIEW, header, payload)
 
 
-class SimulatedStack:
+class SimulatedStack(Closing):
     """A robot in a world with the nodes that drive it; ``step`` advances everything by ``STEP_S``."""
 
     def __init__(self, world: World, config: StackConfig) -> None:
@@ -222,13 +223,6 @@ class SimulatedStack:
     def close(self) -> None:
         """Close the nodes."""
         self.bus.close()
-
-    def __enter__(self) -> SimulatedStack:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        """Close the nodes at the end of the block."""
-        self.close()
 
     def on_record(self, record: Record) -> None:
         """Take a message that a node has published."""
