@@ -7,14 +7,13 @@ from typing import Any
 from instant_ic.adapters.lidar import flat_scan_message, packets_message
 from instant_ic.bus import SENSOR, Node, NodeError, main
 from instant_ic.geometry.poses import pose_matrix
-from instant_ic.lidar.capture import CaptureError
+from instant_ic.lidar.capture import CaptureError, CapturePlayer
 from instant_ic.lidar.config import Vlp16DriverConfig
 from instant_ic.lidar.cover import CoverWatch
 from instant_ic.lidar.feed import PacketFeed, Packets
 from instant_ic.lidar.flatscan import check_level, compensated_scan, warm_up
 from instant_ic.lidar.motion import base_pose
 from instant_ic.lidar.packets import DATA_PACKET_BYTES
-from instant_ic.lidar.player import CapturePlayer
 from instant_ic.lidar.receiver import PacketReceiver, ReceiverError, SensorDatagram
 from instant_ic.lidar.report import LidarReport
 from instant_ic.lidar.stream import Revolution

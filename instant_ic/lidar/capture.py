@@ -1,4 +1,4 @@
-"""UDP payloads from capture files: pcap (either endianness, micro- and nanoseconds) and pcapng.
+"""UDP payloads from capture files, read or played: pcap (either endianness, micro- and nanoseconds) and pcapng.
 
 Source: the pcap and pcapng drafts of the IETF opsawg (draft-ietf-opsawg-pcap, draft-ietf-opsawg-pcapng).
 """
@@ -8,6 +8,8 @@ from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
+
+from instant_ic.util.diagnosis import Diagnosis, Level
 
 _ETHERNET = 1
 _IP_OFFSET = {0: 4, 101: 0, 113: 16, 276: 20}
@@ -139,6 +141,48 @@ class CaptureReader:
                 self.skipped["packet block without a time"] += 1
         if at < size:
             self.skipped["cut record"] += 1
+
+
+class CapturePlayer:
+    """The datagrams of a capture, each when it is due.
+
+    Args:
+        path: capture file.
+        now_ns: clock of the stamps at the start.
+        steady_ns: steady time of the start.
+
+    Raises:
+        CaptureError: the file is not a capture, or holds no UDP datagram.
+        OSError: the file cannot be read.
+    """
+
+    def __init__(self, path: str, now_ns: int, steady_ns: int) -> None:
+        self._reader = CaptureReader(path)
+        self._datagrams = iter(self._reader)
+        self._next: Datagram | None = next(self._datagrams, None)
+        if self._next is None:
+            raise CaptureError(f"{path}: holds no UDP datagram ({dict(self._reader.skipped)})")
+        self._first_ns = self._next.stamp_ns
+        self._start_ns, self._start_steady_ns = now_ns, steady_ns
+
+    @property
+    def ended(self) -> bool:
+        """True after the last datagram."""
+        return self._next is None
+
+    def due(self, steady_ns: int) -> Iterator[Datagram]:
+        """Yield the datagrams that are due at a steady time, with stamps relative to the start of the playback."""
+        elapsed_ns = steady_ns - self._start_steady_ns
+        while self._next is not None and self._next.stamp_ns - self._first_ns <= elapsed_ns:
+            datagram, self._next = self._next, next(self._datagrams, None)
+            yield datagram._replace(stamp_ns=self._start_ns + datagram.stamp_ns - self._first_ns)
+
+    @property
+    def diagnosis(self) -> Diagnosis:
+        """Number of played and of skipped datagrams."""
+        skipped = ", ".join(f"{count} x {reason}" for reason, count in self._reader.skipped.items())
+        text = f"{self._reader.datagrams} datagrams played" + (f"; left out: {skipped}" if skipped else "")
+        return Diagnosis("capture", Level.WARN if skipped else Level.OK, text)
 
 
 def _tick_ns(data: bytes, at: int, end: int, order: str) -> float:
