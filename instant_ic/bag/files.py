@@ -48,16 +48,6 @@ class TopicSummary:
         return ""
 
 
-@dataclass(frozen=True)
-class PartSummary:
-    """One file of a bag: path, first and last stamp, message count."""
-
-    path: Path
-    start_ns: int
-    end_ns: int
-    count: int
-
-
 class BagReader(Closing):
     """Reads a bag; a context manager.
 
@@ -144,18 +134,6 @@ class BagReader(Closing):
         return [Path(storage.path) for storage in self._storages]
 
     @property
-    def parts(self) -> list[PartSummary]:
-        """Message files with their time spans."""
-        if self.path.is_file():
-            return [PartSummary(self.path, self.start_ns, self.end_ns, self.count)]
-        found = []
-        for storage in self._storages:
-            meta, path = storage.metadata, Path(storage.path)
-            span = (int(meta.start_time), int(meta.end_time) - 1) if meta.message_count else (0, 0)
-            found.append(PartSummary(path, *span, int(meta.message_count)))
-        return found
-
-    @property
     def compression(self) -> str:
         """Compression of the messages: ``zstd``, ``lz4`` or empty."""
         kinds = {str(self._reader.compression_format or "")}
@@ -198,7 +176,7 @@ class BagReader(Closing):
                 )
         presets = {(c.topic, c.msgtype): _qos(c) for c in connections}
         try:
-            repetitions = Repetitions(part.start_ns for part in self.parts[1:] if part.count)
+            repetitions = Repetitions(int(storage.metadata.start_time) for storage in self._storages[1:])
             with closing(self._raw(connections, start_ns, stop_ns)) as raw:
                 for connection, stamp_ns, payload in raw:
                     qos = presets[connection.topic, connection.msgtype]

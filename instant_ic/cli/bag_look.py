@@ -37,9 +37,7 @@ def info(args: argparse.Namespace) -> int:
     print(f"duration: {summary['duration_s']:.3f} s")
     print(f"messages: {summary['messages']}")
     if len(summary["files"]) > 1:
-        print("files:")
-        for file in summary["files"]:
-            print(f"  {file['name']}  {file['bytes'] / 1e6:.1f} MB  {file['duration_s']:.3f} s  {file['messages']}")
+        print("files:    " + ", ".join(f"{file['name']} ({file['bytes'] / 1e6:.1f} MB)" for file in summary["files"]))
     topics = summary["topics"]
     width, type_width = (max([len(topic[key]) for topic in topics], default=0) for key in ("topic", "type"))
     for topic in topics:
@@ -89,16 +87,7 @@ def _info(reader: BagReader) -> dict[str, Any]:
         "end_ns": reader.end_ns,
         "duration_s": span_s,
         "messages": reader.count,
-        "files": [
-            {
-                "name": part.path.name,
-                "bytes": part.path.stat().st_size,
-                "start_ns": part.start_ns,
-                "duration_s": (part.end_ns - part.start_ns) / 1e9,
-                "messages": part.count,
-            }
-            for part in reader.parts
-        ],
+        "files": [{"name": file.name, "bytes": file.stat().st_size} for file in reader.files],
         "topics": [
             {
                 "topic": topic.topic,
