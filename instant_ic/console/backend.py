@@ -73,8 +73,4 @@ class PageServer:
         """Send an image or map (JPEG or PNG) to every page; it replaces a pending one of this kind."""
 
     def send_layers(self, layers: PageLayers) -> None:
-        """Send a version of the virtual space to every page; it replaces a pending one.
-
-        Raises:
-            PageProtocolError: a layer that no page could render.
-        """
+        """Send a version of the virtual space, which is checked already, to every page; it replaces a pending one."""

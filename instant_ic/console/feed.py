@@ -18,10 +18,10 @@ from instant_ic.console.display import Display
 from instant_ic.console.faults import ERROR, OK, WARN, FaultList
 from instant_ic.console.gridimage import grid_image
 from instant_ic.console.layers import MOST_LAYERS, LayerMeshes, PageLayers
-from instant_ic.console.protocol import FrameKind, PageProtocolError, PendingFrame
+from instant_ic.console.protocol import FrameKind, PendingFrame
 from instant_ic.console.server import PLAIN_HTTP
 from instant_ic.console.view import ViewSchedule
-from instant_ic.msg import grid_array, header, pose_message, stamp_ns
+from instant_ic.msg import grid_array, header, matrix_from_pose, pose_message, stamp_ns
 from instant_ic.util.pace import current
 
 IMAGE_TIMEOUT_S = 2.0
@@ -86,7 +86,7 @@ class PageFeed:
         stamp = stamp_ns(message)
         self.display.take_image(stamp)
         self.report_shown()
-        fields = page.panorama_header(self._captured_ms(stamp), self.display.lookup("map", "camera", stamp))
+        fields = page.image_header(self._captured_ms(stamp), self.display.lookup("map", "camera", stamp))
         self.server.send_frame(FrameKind.PANORAMA, fields, bytes(message.data))
 
     def take_view(self, message: msg.RenderedView) -> None:
@@ -101,15 +101,18 @@ class PageFeed:
         if delay_s is not None:
             self.display.take_view(request_id, delay_s, message.pose)
             self.report_shown()
-            fields = page.view_header(self._captured_ms(stamp_ns(message)), message)
-            self.server.send_frame(FrameKind.VIEW, fields, bytes(message.image.data))
+            fields = page.image_header(self._captured_ms(stamp_ns(message)), matrix_from_pose(message.pose))
+            self.server.send_frame(FrameKind.VIEW, fields | {"fov": float(message.fov_rad)}, bytes(message.image.data))
         self._request_view()
 
     def layers_of(self, message: msg.VspaceLayers) -> PageLayers | str:
         """Return the layers that pages render, or an error as text. For a worker thread."""
         try:
             layers = layers_of(message)
-            return PageLayers(layers.version, self._mount, self._meshes.layers(layers)[:MOST_LAYERS])
+            made = PageLayers(layers.version, self._mount, self._meshes.layers(layers)[:MOST_LAYERS])
+            made.check()
+            _ = made.digests  # on this thread: hashing takes milliseconds
+            return made
         except ValueError as error:
             return str(error)
 
@@ -118,11 +121,7 @@ class PageFeed:
         if isinstance(layers, str):
             self._diagnose("layers", ERROR, f"Virtual space not shown: {layers}. The page keeps the one before.")
             return
-        try:
-            self.server.send_layers(layers)
-        except PageProtocolError as error:
-            self._diagnose("layers", ERROR, f"Virtual space not shown: {error}. The page keeps the one before.")
-            return
+        self.server.send_layers(layers)
         self._diagnose("layers", OK, "", version=layers.version, layers=len(layers.layers))
 
     def take_control(self, message: msg.ControlState) -> None:

@@ -14,7 +14,6 @@ from instant_ic.msg import (
     BatteryState,
     Path,
     PoseStamped,
-    RenderedView,
     VspaceStatus,
     matrix_from_pose,
     path_array,
@@ -94,20 +93,10 @@ def _battery(battery: BatteryState | None) -> dict[str, Any] | None:
     return {"voltage": voltage, "percent": None if share is None else 100.0 * share}
 
 
-def panorama_header(captured_ms: float, map_from_camera: Matrix | None) -> dict[str, Any]:
-    """Return the header of a panorama's frame."""
-    if map_from_camera is None:
-        return {"captured_ms": captured_ms, "q": None, "p": None}
-    return {"captured_ms": captured_ms, **pose_fields(map_from_camera)}
-
-
-def view_header(captured_ms: float, view: RenderedView) -> dict[str, Any]:
-    """Return the header of a rendered view's frame."""
-    return {
-        "captured_ms": captured_ms,
-        **pose_fields(matrix_from_pose(view.pose)),
-        "fov": float(view.fov_rad),
-    }
+def image_header(captured_ms: float, map_from_camera: Matrix | None) -> dict[str, Any]:
+    """Return the header of a panorama's frame, or the first part of that of a rendered view."""
+    pose = {"q": None, "p": None} if map_from_camera is None else pose_fields(map_from_camera)
+    return {"captured_ms": captured_ms, **pose}
 
 
 def finite(value: Any) -> float | None:

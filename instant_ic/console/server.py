@@ -158,8 +158,6 @@ class ConsoleServer(PageServer):
         self._call(self.pages.send_frame, kind, PendingFrame(header, payload))
 
     def send_layers(self, layers: PageLayers) -> None:
-        layers.check()
-        _ = layers.digests  # on this thread: hashing takes milliseconds
         self._call(self.pages.send_layers, layers)
 
     def drawn_ms(self) -> float | None:
