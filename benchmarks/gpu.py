@@ -57,7 +57,7 @@ REPEATS, SLOW_S = 15, 4.0
 
 @dataclass(frozen=True)
 class GpuRun:
-    """Options of a run.
+    """Options of a run on GPU or CPU.
 
     Attributes:
         devices: names as in ``VirtualSpaceConfig.device``; the first one is judged.

@@ -65,7 +65,7 @@ for (const name of ['drawArrays', 'drawElements']) {
 
 @dataclass(frozen=True)
 class LoadSample:
-    """Everything that is counted, at one moment."""
+    """Counters of stack, browser, camera and page at one moment."""
 
     stack: Usage
     browser_s: float

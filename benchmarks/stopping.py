@@ -4,10 +4,9 @@
     python benchmarks/stopping.py --json stopping.json
     python benchmarks/stopping.py --only arbiter --only "LiDAR packets" --repeat 5
 
-A simulated stack of real processes (without depth and virtual space, which do not move the robot in REAL) drives
-through free space at 0.38 m/s. Then one thing is lost: a process is frozen (SIGSTOP) or killed (SIGKILL), a device or
-link is cut, the page disconnects, or the emergency stop is pressed. Measured from that moment, by the simulator's true
-motion:
+A simulated stack of real processes (without depth and virtual space, which do not move the robot in REAL) drives at
+0.38 m/s. Then one thing is lost: a process is frozen (SIGSTOP) or killed (SIGKILL), a device or link is cut, the page
+disconnects, or the emergency stop is pressed. Measured from that moment, by the simulator's true motion:
 
     detect_s    to the first sign of the stop: /cmd_vel, the speed commanded to the motor controller, or the true speed
                 falls by a tenth
