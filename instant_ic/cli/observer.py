@@ -1,4 +1,4 @@
-"""Raw subscriptions for commands, which are not nodes."""
+"""Raw subscriptions for commands, which are not nodes; the newest heartbeat of each node."""
 
 from __future__ import annotations
 
@@ -6,15 +6,18 @@ import os
 import sys
 import threading
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
+from contextlib import suppress
 from pathlib import Path
 
 from instant_ic.bus import RELIABLE, registry
 from instant_ic.bus.clock import SystemClock
+from instant_ic.bus.heartbeat import TYPE, Heartbeat, from_message
 from instant_ic.bus.local_transport import LocalTransport
 from instant_ic.bus.transport import RawSubscription, Received
 from instant_ic.cli.errors import UserError
 from instant_ic.cli.names import absolute, unknown_topic
+from instant_ic.msg import deserialize
 from instant_ic.util import pace, paths
 from instant_ic.util.closing import Closing
 
@@ -94,3 +97,32 @@ def newest(topic: str, timeout_s: float) -> Received | None:
     """Return the next message of a topic; None without one within ``timeout_s``."""
     with TopicObserver(topic) as observer:
         return next((received for batch in observer.batches(timeout_s, 0.1) for received in batch), None)
+
+
+class Heartbeats(TopicObserver):
+    """Listens to the heartbeats of every node in a run directory."""
+
+    def __init__(self, run_dir: Path) -> None:
+        topics = {info.topic for info in registry.list_topics(run_dir) if info.type_name == TYPE}
+        super().__init__(sorted(topics | {"/heartbeat"}), run_dir=run_dir)
+        self.newest: dict[str, Heartbeat] = {}
+
+    def listen(self, seconds: float, until: Collection[str] = ()) -> dict[str, Heartbeat]:
+        """Listen for some time, or until all the named nodes were heard; return the newest heartbeat of each node."""
+        for batch in self.batches(seconds, 0.1):
+            for received in batch:
+                if received.type_name == TYPE:
+                    with suppress(ValueError):  # it cannot be read: the node counts as silent
+                        beat = from_message(deserialize(received.payload, received.type_name))
+                        self.newest[beat.node] = beat
+            if until and all(node in self.newest for node in until):
+                break
+        return self.newest
+
+
+def hear(run_dir: Path, nodes: Collection[str], seconds: float = 2.5) -> dict[str, Heartbeat]:
+    """Return the heartbeats of the given nodes, without those that send none within ``seconds``."""
+    if not nodes:
+        return {}
+    with Heartbeats(run_dir) as heartbeats:
+        return heartbeats.listen(seconds, nodes)

@@ -19,8 +19,8 @@ from instant_ic.bus import registry
 from instant_ic.bus.control import ControlError, NodeControl
 from instant_ic.bus.heartbeat import Heartbeat
 from instant_ic.cli.errors import UserError
-from instant_ic.cli.heartbeats import Heartbeats
 from instant_ic.cli.names import nobody_runs
+from instant_ic.cli.observer import Heartbeats
 from instant_ic.launch.node_table import NodeRow, heartbeat_row, node_table
 from instant_ic.util import paths
 from instant_ic.util.safe_text import direct

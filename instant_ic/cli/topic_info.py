@@ -9,8 +9,8 @@ from instant_ic.bus import registry
 from instant_ic.bus.control import ControlError, NodeControl
 from instant_ic.bus.heartbeat import Heartbeat
 from instant_ic.cli.errors import UserError
-from instant_ic.cli.heartbeats import hear
 from instant_ic.cli.names import absolute, find_node, near, topic_types
+from instant_ic.cli.observer import hear
 from instant_ic.cli.tables import print_table
 from instant_ic.launch.topics import expected_rate
 from instant_ic.util import paths
