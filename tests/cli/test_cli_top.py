@@ -1,13 +1,7 @@
 """``ic top``: rows from heartbeats and nominal rates; the live table on a real terminal."""
 
 import math
-import os
-import pty
 import re
-import select
-import signal
-import subprocess
-import sys
 import time
 
 import pytest
@@ -68,27 +62,3 @@ def test_nobody_runs(ic, tmp_path, monkeypatch):
     monkeypatch.setenv("INSTANT_IC_RUN_DIR", str(tmp_path))
     status, _, error = ic("top")
     assert status == 1 and "no node is running in" in error
-
-
-def test_live_table_on_a_terminal(run_dir):
-    """Drawn until Ctrl-C."""
-    master, slave = pty.openpty()
-    environment = {**os.environ, "INSTANT_IC_RUN_DIR": str(run_dir), "TERM": "xterm-256color", "COLUMNS": "150"}
-    process = subprocess.Popen(
-        [sys.executable, "-m", "instant_ic.cli.main", "top", "-d", "0.2"],
-        stdin=slave, stdout=slave, stderr=slave, env=environment,
-    )  # fmt: skip
-    seen = b""
-    try:
-        deadline_s = time.monotonic() + 40
-        while b"talker" not in seen or b"sorted by cpu" not in seen:
-            assert time.monotonic() < deadline_s, seen[-2000:].decode(errors="replace")
-            if select.select([master], [], [], 0.2)[0]:
-                seen += os.read(master, 65536)
-        process.send_signal(signal.SIGINT)
-        assert process.wait(20) == 130
-    finally:
-        process.kill()
-        process.wait()
-        os.close(master)
-        os.close(slave)

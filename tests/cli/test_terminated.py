@@ -40,22 +40,19 @@ def waiting(ignored: signal.Signals | None = None) -> subprocess.Popen[str]:
     return process
 
 
-@pytest.mark.parametrize(("signum", "status"), [(signal.SIGTERM, 143)])
-def test_a_command_cleans_up_and_reports_the_signal(signum: int, status: int) -> None:
+def test_a_command_cleans_up_and_reports_the_signal() -> None:
     process = waiting()
-    process.send_signal(signum)
+    process.send_signal(signal.SIGTERM)
     out, _ = process.communicate(timeout=60)
-    assert (out, process.returncode) == ("removed\n", status)
+    assert (out, process.returncode) == ("removed\n", 143)
 
 
-def test_a_script_ends_a_command_in_the_background_by_sigint() -> None:
-    process = waiting(ignored=signal.SIGINT)  # as sh starts `COMMAND &`
-    process.send_signal(signal.SIGINT)
+# As sh starts `COMMAND &`, and as nohup starts a command; 143, had the hangup counted.
+@pytest.mark.parametrize(("ignored", "sent"), [(signal.SIGINT, []), (signal.SIGHUP, [signal.SIGHUP])])
+def test_sigint_ends_a_command_and_an_ignored_hangup_does_not(
+    ignored: signal.Signals, sent: list[signal.Signals]
+) -> None:
+    process = waiting(ignored)
+    for signum in (*sent, signal.SIGINT):
+        process.send_signal(signum)
     assert process.wait(60) == 130
-
-
-def test_a_hangup_that_nohup_ignores_stays_ignored() -> None:
-    process = waiting(ignored=signal.SIGHUP)
-    process.send_signal(signal.SIGHUP)
-    process.send_signal(signal.SIGINT)
-    assert process.wait(60) == 130  # 143, had the hangup counted
