@@ -18,7 +18,7 @@ from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 from aiohttp import WSMsgType, web
 
@@ -30,8 +30,8 @@ from instant_ic.bus.qos import PRESETS, RELIABLE
 from instant_ic.bus.registry import TopicInfo
 from instant_ic.bus.transport import Received
 from instant_ic.config.params import flatten
-from instant_ic.config.ranges import Range, check_ranges
-from instant_ic.util.web_access import SIGN_IN, refusal, sign_in_needed
+from instant_ic.config.ranges import Checked, Range
+from instant_ic.util.web_access import refusal, sign_in_needed
 
 _END_S = 2.0
 _HEARTBEAT_S = 30.0
@@ -49,7 +49,7 @@ class FoxgloveError(RuntimeError):
 
 
 @dataclass(frozen=True)
-class FoxgloveBridgeConfig:
+class FoxgloveBridgeConfig(Checked):
     """Parameters of ``foxglove_bridge``.
 
     Attributes:
@@ -68,18 +68,13 @@ class FoxgloveBridgeConfig:
 
     host: str = "127.0.0.1"
     port: Annotated[int, Range(0, 65535)] = 8765
-    sign_in: str = "auto"
+    sign_in: Literal["auto", "always", "never"] = "auto"
     simulated: bool = False
     allowed_origins: tuple[str, ...] = ("https://app.foxglove.dev", "file://")
     allowed_hosts: tuple[str, ...] = ()
     max_clients: Annotated[int, Range(1, 256)] = 16
     topics: tuple[str, ...] = ()
     exclude: tuple[str, ...] = ()
-
-    def __post_init__(self) -> None:
-        check_ranges(self)
-        if self.sign_in not in SIGN_IN:
-            raise ValueError(f"sign_in must be one of {', '.join(SIGN_IN)} (got {self.sign_in!r})")
 
 
 def read_parameters(run_dir: Path, names: Sequence[str]) -> dict[str, Any]:
