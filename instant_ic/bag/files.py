@@ -7,7 +7,7 @@ import logging
 from collections import Counter
 from collections.abc import Callable, Collection, Generator, Iterator
 from contextlib import closing
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -153,6 +153,7 @@ class BagReader(Closing):
         topics: Collection[str] | None = None,
         start_ns: int | None = None,
         stop_ns: int | None = None,
+        current: bool = False,
     ) -> Iterator[BagMessage]:
         """Yield the messages in stamp order.
 
@@ -160,6 +161,7 @@ class BagReader(Closing):
             topics: topics to read; default all.
             start_ns: first stamp, inclusive.
             stop_ns: last stamp, exclusive.
+            current: convert messages of older definitions to the present one (``upgrade.py``).
 
         Raises:
             BagError: a file is damaged.
@@ -175,39 +177,20 @@ class BagReader(Closing):
                     f"topics, or copy those in CDR: ic bag recover {self.path}"
                 )
         presets = {(c.topic, c.msgtype): _qos(c) for c in connections}
+        upgrades = (
+            {(topic.topic, topic.type_name): upgrade_of(topic.schema) for topic in self.topics} if current else {}
+        )
         try:
             repetitions = Repetitions(int(storage.metadata.start_time) for storage in self._storages[1:])
             with closing(self._raw(connections, start_ns, stop_ns)) as raw:
                 for connection, stamp_ns, payload in raw:
-                    qos = presets[connection.topic, connection.msgtype]
-                    message = BagMessage(connection.topic, connection.msgtype, payload, stamp_ns, qos)
+                    key = (connection.topic, connection.msgtype)
+                    upgrade = upgrades.get(key)
+                    message = BagMessage(*key, payload if upgrade is None else upgrade(payload), stamp_ns, presets[key])
                     if not repetitions.repeats(message):
                         yield message
         except Exception as error:  # noqa: BLE001 - a parser or decompressor may raise anything on damaged bytes
             raise BagError(f"bag {self.path} is damaged: {error}; try ic bag recover {self.path}") from None
-
-    def current_messages(
-        self,
-        topics: Collection[str] | None = None,
-        start_ns: int | None = None,
-        stop_ns: int | None = None,
-    ) -> Iterator[BagMessage]:
-        """Yield what :meth:`messages` does, with older definitions converted to the present one (``upgrade.py``).
-
-        Raises:
-            BagError: a file is damaged.
-        """
-        upgrades = {(topic.topic, topic.type_name): upgrade_of(topic.schema) for topic in self.topics}
-        for message in self.messages(topics, start_ns, stop_ns):
-            upgrade = upgrades.get((message.topic, message.type_name))
-            if upgrade is None:
-                yield message
-                continue
-            try:
-                payload = upgrade(message.payload)
-            except Exception as error:  # noqa: BLE001 - generated code may raise anything on damaged bytes
-                raise BagError(f"bag {self.path}, topic {message.topic}: a message is damaged: {error}") from None
-            yield replace(message, payload=payload)
 
     def decoder(self, topic: TopicSummary) -> Callable[[bytes], Any]:
         """Return a function that decodes a topic's bytes: by our type, or by the bag's definition where that differs.

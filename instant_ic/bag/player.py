@@ -229,7 +229,7 @@ class BagPlayer:
             self.sent += 1
 
     def _messages(self, topics: set[str], start_ns: int | None, stop_ns: int) -> Iterator[BagMessage]:
-        messages = self._reader.current_messages(topics, start_ns, stop_ns)
+        messages = self._reader.messages(topics, start_ns, stop_ns, current=True)
         return (message for message in messages if message.type_name == self._types[message.topic])
 
     def _anchor(self, stamp_ns: int) -> None:

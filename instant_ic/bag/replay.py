@@ -163,7 +163,7 @@ def replay(
                 _check_types(reader, bus)
                 span_ns = max(1, reader.end_ns - reader.start_ns)
                 result.bag_s, result.setup_s = span_ns / 1e9, time.monotonic() - began_s
-                for message in reader.current_messages():
+                for message in reader.messages(current=True):
                     _feed(message, bus, running, made_frames, result)
                     if on_progress is not None:
                         on_progress((message.stamp_ns - reader.start_ns) / span_ns)

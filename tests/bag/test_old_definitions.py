@@ -49,7 +49,7 @@ def bag(tmp_path: Path) -> Path:
 def test_an_older_message_is_read_as_the_present_one_with_an_unknown_code(bag: Path) -> None:
     with BagReader(bag) as reader:
         assert [topic.problem for topic in reader.topics] == [""]
-        found = [deserialize(m.payload, m.type_name) for m in reader.current_messages()]
+        found = [deserialize(m.payload, m.type_name) for m in reader.messages(current=True)]
         assert [message.mode for message in found] == [0, 1, 2]
         assert {(m.reason, m.estop, m.reason_code) for m in found} == {
             ("stopped: no camera image for 1.6 s", True, ControlState.REASON_UNKNOWN)
