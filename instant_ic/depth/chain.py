@@ -115,7 +115,7 @@ class DepthChain:
         self.images[image.stamp_ns] = message
         if len(self.images) > _MAX_IMAGES:
             del self.images[next(iter(self.images))]
-        # Also what lies ahead is discarded: the clock may have gone back.
+        # Inputs from the future are discarded too: the clock may have gone back.
         kept_ns = self.requests.since_ns or image.stamp_ns
         for old in [other for other in self.images if abs(other - kept_ns) > KEEP_NS]:
             del self.images[old]
@@ -160,7 +160,7 @@ class DepthChain:
         return self._trigger.revolution(revolution.middle_ns)
 
     def estimate(self, raw: NDArray[np.float32] | None, image: HeldImage) -> DepthResult:
-        """Estimate the depth of an image; if something is missing the result is not ok, and its message says what.
+        """Estimate the depth of an image; without poses or points the result is not ok, and its message says why.
 
         Args:
             raw: the network's depth, (H, W); None for the source ``lidar``.

@@ -61,8 +61,8 @@ class Corrected:
 def correct(network_m: Floats, measured_m: Floats) -> Corrected:
     """Correct scaled network depth (H, W) by a smooth field of factors from ranges (H, W), 0 where there is none.
 
-    The field is the weighted mean of the log ratios over a Gaussian around each pixel, 1 far from any point; the
-    second time what is far from the first counts little.
+    The field is the weighted mean of the log ratios over a Gaussian around each pixel; far from any point it is 1. It
+    is computed twice: the second time, ratios far from the first field count little.
     """
     height, width = network_m.shape
     seen = (measured_m > 0) & (network_m > 0)

@@ -1,4 +1,4 @@
-"""When a new keyframe is due, what to do while the depth cannot be trusted, and how its uncertainty is written."""
+"""Selection of keyframes, and encoding of their uncertainty."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from instant_ic.config.ranges import Checked, NotNegative, Positive
 
 @dataclass(frozen=True)
 class KeyframeSelectionConfig(Checked):
-    """When keyframes are taken.
+    """Selection of keyframes.
 
     Attributes:
         distance_m: metres of motion to a new keyframe; smaller renews the virtual space more often.
         angle_deg: degrees of rotation to a new keyframe.
-        refresh_s: seconds after which the keyframe of a standing robot is taken again, for what has moved around it.
+        refresh_s: seconds after which a standing robot takes a new keyframe, because things around it may have moved.
         unfit_after_s: seconds that a due keyframe waits for depth that can be scaled.
     """
 

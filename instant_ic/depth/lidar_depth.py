@@ -224,7 +224,7 @@ class LidarStructure:
         Args:
             points: (N, 3) in the camera's frame, metres; points that are not finite are left out.
             up: (3,) gravity's up in the camera's frame.
-            camera_height_m: of the camera over the floor; None: the floor is looked for in the points.
+            camera_height_m: height of the camera over the floor; None searches the points for the floor.
             size: height and width of the image.
             ceiling_m: height of a ceiling over the camera that is taken where no point shows one (instead of the
                 assumed height).
@@ -420,7 +420,7 @@ class _Building:
         np.copyto(origin, np.uint8(Origin.BETWEEN), where=plate)
 
     def _planes(self, depth: Floats, origin: NDArray[np.uint8], wall: Floats) -> None:
-        """Cut the surfaces by floor and ceiling, which hide what lies behind them."""
+        """Cut the surfaces at floor and ceiling, which hide everything behind them."""
         to_floor = np.where(self.sin < 0, -self.ground / self.sin, np.inf)
         np.copyto(origin, np.uint8(self.ground_origin), where=to_floor < depth)
         np.minimum(depth, to_floor, out=depth)

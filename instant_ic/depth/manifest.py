@@ -91,7 +91,7 @@ def load_manifest(path: str | Path) -> ModelManifest:
     """Read and check a manifest.
 
     Raises:
-        ManifestError: with the file, the line, the key and what it should be.
+        ManifestError: the manifest is wrong; the text names file, line, key and the expected value.
     """
     path = Path(path)
     if not paths.is_file(path):

@@ -26,7 +26,7 @@ class DepthModel:
 
     Attributes:
         manifest: interface of the model.
-        provider: ``tensorrt``, ``cuda`` or ``cpu``: what runs it.
+        provider: execution provider in use, ``tensorrt``, ``cuda`` or ``cpu``.
 
     Example:
         >>> model = DepthModel.load("models/slicenet_small.onnx")      # doctest: +SKIP
@@ -111,7 +111,7 @@ class DepthModel:
 
         Raises:
             ValueError: not such an array.
-            ManifestError: the outputs are not what the manifest says.
+            ManifestError: the outputs differ from the manifest.
             InferenceError: the network failed, or :meth:`cancel` ended it.
         """
         if self.manifest.prior_input:
@@ -244,5 +244,5 @@ class DepthModel:
 
 
 def _fits(shape: list[Any], expected: list[int]) -> bool:
-    """Return whether a network's input shape, with text or None for what is open, takes ``expected``."""
+    """Return whether a network's input shape, with text or None for open sizes, takes ``expected``."""
     return len(shape) == 4 and all(not isinstance(a, int) or a == b for a, b in zip(shape, expected, strict=True))

@@ -75,7 +75,7 @@ class SourceConfig:
 
 @dataclass(frozen=True)
 class Prior:
-    """Input of a completion, and what it may not change.
+    """Input of a completion, and the pixels that it may not change.
 
     Attributes:
         channels: (6, H, W), see ``depth.completion.prior_channels``.
@@ -204,7 +204,7 @@ class DepthSource:
         )
 
     def _fused(self, fit: ScaleFit, network: Corrected, built: _Built) -> DepthResult:
-        """Fill what the LiDAR leaves unknown by the network, never nearer than free space."""
+        """Fill pixels that the LiDAR leaves unknown by the network, never nearer than free space."""
         known = built.depth_m > 0
         guess = np.maximum(network.depth_m, built.free_m)
         depth = np.where(known, built.depth_m, guess)
@@ -282,10 +282,10 @@ class DepthSource:
 def complete(result: DepthResult, completion: Complete) -> DepthResult:
     """Correct a result of the source ``completed``; needs no other state, so that any thread may do it.
 
-    Floor and what is assumed or guessed are changed where the completion plainly contradicts them over an area, never
-    to nearer than free space. A completion places nothing better than the LiDAR that has measured it: it bends a
-    pillar and lowers a bare ceiling. Without a prior, and where the completion fails, the result stays as it is, and
-    its message says why.
+    The completion changes the floor and assumed or guessed surfaces where it plainly contradicts them over an area,
+    but never to nearer than free space. Measured surfaces stay: there the LiDAR is better, and the completion bends
+    pillars and lowers bare ceilings. Without a prior, or if the completion fails, the result stays as it is; its
+    message gives the reason.
     """
     prior = result.prior
     if prior is None:

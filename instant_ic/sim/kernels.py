@@ -46,7 +46,7 @@ class Projection(NamedTuple):
     Attributes:
         across, down, scale: tables of the lens, see ``render._Lens``.
         strides: (H,) columns per shaded pixel.
-        wraps: whether the image is a panorama.
+        wraps: True for a panorama.
     """
 
     across: F32
@@ -591,7 +591,7 @@ class Work(NamedTuple):
         root: tone indices of the row's pixels, (3, N).
         values: buffer of ``_shade``.
         line: surface of each pixel of the row, (N,).
-        differs: whether a neighbour shows another surface, (N,).
+        differs: True where a neighbour shows another surface, (N,).
         near: surfaces in and around the edge pixel.
         weight: number of samples of each of ``near``.
         shift: sum of the samples' rows and columns, for each of ``near``.

@@ -1,8 +1,8 @@
 """Track motors under the speed loops of the controller, with their power, current and encoders.
 
-A healthy loop is tuned: the track follows its set point with its lag and acceleration. The loop
-regulates what the encoder counts. What the encoder does not count of that motion is an error, which the loop integrates
-(wind-up) until the power saturates: a dead encoder lets the track run away, a reversed one drives it away at once.
+A healthy loop is tuned: the track follows its set point with its lag and acceleration. The loop regulates the counted
+motion. Motion that the encoder does not count is an error, which the loop integrates (wind-up) until the power
+saturates: with a dead encoder the track runs away, with a reversed one it does so at once.
 """
 
 import math
@@ -36,12 +36,12 @@ class TrackMotors:
         counted: distances that the encoders counted, metres, (2,).
         power: share of full power that each motor gets, -1 to 1, (2,).
         currents_a: currents that the controller measures, amperes, (2,).
-        encoders: what each encoder counts of its track's motion, (2,): 1 healthy, 0 dead, -1 reversed.
-        blocked: whether each track is held fast, (2,).
+        encoders: counted share of each track's motion, (2,): 1 healthy, 0 dead, -1 reversed.
+        blocked: True for a track that is held fast, (2,).
         load: power that each track needs beyond that of a free run, (2,).
         stiction: power below which a standing track does not start, (2,).
         battery_v: voltage of the main battery.
-        gain, integral_gain: of the speed loop; m/s per m/s, and m/s per metre.
+        gain, integral_gain: gains of the speed loop, m/s per m/s and m/s per metre.
     """
 
     def __init__(self, acceleration: float, lag_s: float, resistance: float, seed: int = 0) -> None:

@@ -107,7 +107,7 @@ class RealTimeLoop:
 
     Args:
         simulation: it is stepped.
-        scanner: sends what it has scanned after each step.
+        scanner: sends its complete packets after each step; None for none.
         on_fault: called on the thread when a step fails; the loop has ended then.
 
     Attributes:

@@ -41,7 +41,7 @@ class RoboclawEmulator:
         target_speed_pps: target speed of the last command, pulses/s, (2,) M1 and M2.
         acceleration_pps2: ramp of the last command, pulses/s^2; 0 means no ramp.
         setpoint_pps: target after the ramp, pulses/s, (2,).
-        closed_loop: whether the speed loops regulate; otherwise the set points are power, as the speed without load.
+        closed_loop: True while the speed loops regulate; otherwise the set points are power, as the speed without load.
         speed_pps: speed measured by the encoders, pulses/s, (2,).
         encoder: counted pulses, (2,); replies carry them modulo 2^32.
         power: power on the motors, -1 to 1, (2,).
@@ -54,7 +54,7 @@ class RoboclawEmulator:
             a restart.
         limit_bytes: length of each limit in commands 109 and 110: 2 or 4; 0 for firmware without them.
         timeout_s: serial watchdog; 0 is off.
-        watchdog_fired: whether the watchdog stopped the motors; the next valid packet resets it.
+        watchdog_fired: True after the watchdog stopped the motors; the next valid packet resets it.
         bad_packets: frames dropped for their CRC, an unknown command or a gap between bytes.
         packets: valid frames.
     """

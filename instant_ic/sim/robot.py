@@ -49,7 +49,7 @@ class TrackedRobot:
     """Robot on the floor plan.
 
     Args:
-        mask: where objects stop the robot.
+        mask: places where objects stop the robot.
         pose: x, y, yaw at the start.
         seed: seed of slip and noise.
         footprint: outline.
@@ -59,7 +59,7 @@ class TrackedRobot:
         pose: (3,) x, y, yaw (unwrapped) in the world's frame.
         twist: (3,) true v_x, v_y, yaw rate in the robot's frame.
         motors: motors of the tracks.
-        contact: whether the robot pushes against something.
+        contact: True while the robot pushes against something.
         contacts: number of contacts so far.
     """
 
@@ -126,7 +126,7 @@ class TrackedRobot:
         Args:
             setpoint_pps: set points of the motors (2,), pulses/s.
             dt_s: seconds.
-            closed_loop: whether the speed loops regulate; otherwise the set points are power.
+            closed_loop: True while the speed loops regulate; otherwise the set points are power.
         """
         config = self.config
         mean = self.motors.step(self.kinematics.tracks_from_motors(setpoint_pps), dt_s, closed_loop)

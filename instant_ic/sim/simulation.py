@@ -169,7 +169,7 @@ class Simulation:
 
 
 def drive(robot: TrackedRobot, controller: RoboclawEmulator, dt_s: float) -> None:
-    """Advance the robot by what its controller demands, and report to the controller what it measures."""
+    """Advance the robot by its controller's demands, and give the controller its measurements."""
     motors, kinematics = robot.motors, robot.kinematics
     motors.battery_v = controller.battery_v
     robot.step(controller.setpoint_pps, dt_s, controller.closed_loop)

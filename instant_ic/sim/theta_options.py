@@ -1,4 +1,4 @@
-"""Options of a Ricoh Theta Z1 as its Web API documents them: values that it accepts, and what it reports.
+"""Options of a Ricoh Theta Z1 as its Web API documents them: accepted and reported values.
 
 Source: ricohapi/theta-api-specs, theta-web-api-v2.1 (options, protocols/errors).
 """

@@ -1,4 +1,4 @@
-"""Agreement between keyframes: which pixels show moved objects, and which factors bring colours to one exposure.
+"""Agreement between keyframes: pixels that show moved objects, and factors that bring colours to one exposure.
 
 1. ``moved``: each keyframe votes on each surface of another: seen, seen through, or unknown. The majority counts.
 2. ``exposure_gains``: robust ratio of the colours of places that two keyframes have both seen.
@@ -49,10 +49,9 @@ CONFIG = AgreementConfig()
 def moved(priors: Sequence[PanoramaPrior]) -> list[NDArray[np.bool_]]:
     """Mark the pixels of keyframes (newest first, of one size) that show moved or moving objects, (h, w) each.
 
-    Each keyframe that knows says whether there is a surface at a pixel's place or whether it has looked through it; the
-    majority counts, and where there is none the newest: of two keyframes the newer wins. What of the newest another's
-    image shows in the same colour at that place still stands there, and only the depths disagree: it is left in, and
-    so are single pixels.
+    Each keyframe that knows the place of a pixel votes: there is a surface, or it has looked through the place. The
+    majority counts; in a tie, the newest keyframe. A pixel of the newest keyframe stays if another keyframe's image has
+    the same colour there: then the object still stands, and only the depths disagree. Single pixels stay too.
     """
     from instant_ic.vspace.agreement_kernels import outvoted
 
@@ -123,12 +122,12 @@ def exposure_gains(priors: Sequence[PanoramaPrior]) -> Floats:
 def exposure_gain(newest: PanoramaPrior, older: PanoramaPrior) -> Floats | None:
     """Fit factors (3,) that bring an older keyframe's colours to the newest's at places that both have seen.
 
-    The middle of the shortest interval that holds half of the ratios, a colour (the shorth): what has changed between
-    the two, such as a lamp or a shadow, does not move it as long as it is less than half. Where no factor differs from
-    1 by more than the interval is wide, the evidence is weak, and all are 1.
+    A factor is the middle of the shortest interval that holds half of a channel's ratios (the shorth). Changes of less
+    than half of the places, such as a lamp or a shadow, do not move it. If no factor differs from 1 by more than its
+    interval's width, the evidence is weak, and all are 1.
 
     Returns:
-        None where too few places are seen by both, or where their ratios have no common factor.
+        The factors; None if both have seen too few places, or their ratios have no common factor.
     """
     height, width = older.inverse_depth.shape
     step = max(1, height // CONFIG.fit_rows)

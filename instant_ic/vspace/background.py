@@ -37,7 +37,7 @@ class BackgroundConfig:
         reach_rad: largest distance from a depth edge at which hidden pixels are filled.
         edge_ratio: relative step of the inverse depth that is a depth edge here; less is noise.
         on_plane: largest relative difference of inverse depths at which a pixel is on floor or ceiling.
-        behind: factor by which a hidden surface must lie farther than what hides it.
+        behind: factor by which a hidden surface must lie farther than the surface in front of it.
         steep: smallest sine of the elevation of the pixels that floor and ceiling are fitted to.
         plane_tolerance: largest relative difference of a pixel's height from a plane's that still counts as on it.
         plane_share: smallest share of the steep pixels that must lie on a plane.
@@ -61,7 +61,7 @@ class BackgroundConfig:
 
 CONFIG = BackgroundConfig()
 OTHER, FLOOR, CEILING, NOTHING = 0, 1, 2, 9
-"""Kinds of pixels: walls and things, floor, ceiling, and what is no surface of the place."""
+"""Kinds of pixels: walls and things, floor, ceiling, and pixels without a surface of the place."""
 
 
 @dataclass(frozen=True)

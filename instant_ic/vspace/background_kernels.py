@@ -12,7 +12,7 @@ from instant_ic.vspace.nerf.march import along, panorama_pixels
 from instant_ic.vspace.warp_kernels import NEAR_M, beyond, rasterize_triangle
 
 SAME_THING = np.float32(2)
-"""A surface nearer than an object's edge by more than this factor is not the object but what it stands on."""
+"""A surface nearer than an object's edge by more than this factor is the ground that the object stands on."""
 
 
 @njit(**_OPTIONS)
@@ -70,8 +70,10 @@ def render_quads(  # type: ignore[no-untyped-def]
     """Render some quads of a panorama's mesh into a z-buffer.
 
     Args:
-        quads: upper left pixels (row, column), (N, 2); mark: what ``marks`` gets.
-        inverse: (h, w); directions: of the pixels, (h, w, 3).
+        quads: upper left pixels (row, column), (N, 2).
+        mark: value that is written to ``marks``.
+        inverse: inverse depth, (h, w).
+        directions: directions of the pixels, (h, w, 3).
         view_from_camera, half, nearness, marks: as in ``warp_kernels.render_mesh``.
     """
     width = inverse.shape[1]

@@ -123,7 +123,7 @@ class VirtualSpaceConfig:
         device: cpu: numba; cuda: Triton on an NVIDIA GPU, geometry distance only; auto: cuda where it works, else cpu.
         panorama_width: px; wider panoramas are area-averaged to this.
         keyframes: newest keyframes that the field is trained on together, 1..8.
-        older: older keyframes, from up to 3 m away, whose pixels show what is hidden from the newest; costs nothing per
+        older: older keyframes, from up to 3 m away, whose pixels show places hidden from the newest; costs nothing per
             view.
         view: the keyframe's panorama warped by its depth, or the field.
     """

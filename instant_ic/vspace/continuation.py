@@ -1,7 +1,7 @@
-"""Continuation of walls, floor and ceiling of a panorama behind what hides them.
+"""Continuation of walls, floor and ceiling of a panorama behind nearer surfaces.
 
-1. ``continued_walls``: find the wall behind each hidden pixel. A wall is upright: what is seen of it above a near
-   surface goes on below; where nothing is, the planes of the walls at both sides go on.
+1. ``continued_walls``: find the wall behind each hidden pixel. A wall is upright: its visible part above a near surface
+   goes on below. Without a visible part, the planes of the walls at both sides go on.
 2. ``continued_colours``: colour each surface from its own visible part, and mix the surfaces within a pixel of the line
    where they meet. Floor and ceiling are level planes, so that a row lies at one distance.
 """
@@ -24,7 +24,7 @@ class ContinuationConfig:
 
     Attributes:
         same: largest ratio of neighbouring distances of one surface.
-        wall_behind: smallest ratio of the distance of a wall to that of what hides it; nearer ones are hidden by the
+        wall_behind: smallest ratio of a wall's distance to that of the surface before it; nearer ones are hidden by the
             depth's error.
         far_share: share of a column's upright surfaces, from the far end, that count as its farthest wall.
         look_rad: height above a near surface in which its wall is looked for.
@@ -121,11 +121,11 @@ def continued_colours(
         walls: walls of ``continued_walls``.
 
     Returns:
-        The panorama with hidden pixels in the colours of what lies behind, (h, w, 3), and their opacity, (h, w) uint8.
+        The panorama with hidden pixels in the hidden surfaces' colours, (h, w, 3), and their opacity, (h, w) uint8.
     """
     hole, upright = walls.hole, walls.upright
     total, covered, sure = np.zeros(rgb.shape, np.float32), np.zeros(hole.shape, np.float32), np.zeros_like(upright)
-    weight = np.maximum(upright, np.float32(1e-3)) ** np.float32(-4)  # what is far goes on behind what is near
+    weight = np.maximum(upright, np.float32(1e-3)) ** np.float32(-4)  # far surfaces go on behind near ones
     for number, plane in enumerate(planes):
         # Within a pixel of the line where two planes meet both have a share.
         ahead = plane - np.delete(planes, number, 0).max(axis=0)

@@ -1,4 +1,4 @@
-"""CPU kernels that continue walls, floor and ceiling of a panorama behind what hides them (numba)."""
+"""CPU kernels that continue walls, floor and ceiling of a panorama behind nearer surfaces (numba)."""
 
 from __future__ import annotations
 
@@ -36,15 +36,15 @@ def walls_behind(  # type: ignore[no-untyped-def]
 ):
     """Continue upright walls behind near surfaces.
 
-    What is seen above a near surface goes on behind it. Where nothing behind it is seen above it, the planes of the
-    walls at its left and right go on; two of them meet in a corner.
+    A wall that is visible above a near surface goes on behind it. If none is visible, the planes of the walls at its
+    left and right go on; two of them meet in a corner.
 
     Args:
         upright, wall: as in ``farthest_walls``; hole: near surfaces, (h, w).
         far: result of ``farthest_walls``.
         look, span: rows above a near surface, and columns beside it, that a wall is fitted to.
         same: neighbours whose distances differ by less than this factor are one surface.
-        behind: a wall is farther than what hides it by this factor.
+        behind: factor by which a wall must be farther than the surface before it.
         slope_prior: pseudo-observations for a wall at right angles to the ray; farthest: in metres.
         found: out, (h, w) inverse horizontal distance of the wall, 0 where there is none.
     """
@@ -144,7 +144,7 @@ def wall_colours(rgb, source, upright, far, same, colours):  # type: ignore[no-u
 
 @njit(**_OPTIONS)
 def _colour_above(rgb, source, upright, found, v, u, same, some, total):  # type: ignore[no-untyped-def]
-    """Write the median colour of what is seen of the wall above a pixel; return False if nothing is.
+    """Write the median colour of the wall's visible part above a pixel; return False if there is none.
 
     Args:
         rgb, source, upright, found, same: as in ``continue_walls``; v, u: the pixel.
@@ -215,8 +215,8 @@ def continue_walls(  # type: ignore[no-untyped-def]
 ):  # fmt: skip
     """Continue the colours of walls into holes.
 
-    The colour of what is seen of the wall above counts first, else those of both sides: near them as they are at the
-    same height, farther on in the wall's common colour.
+    The colour of the wall's visible part above counts first. Without one, those of both sides count: near them the
+    colours at the same height, farther away the wall's common colour.
 
     Args:
         rgb: panorama, (h, w, 3); source: pixels of walls, (h, w).
@@ -224,8 +224,9 @@ def continue_walls(  # type: ignore[no-untyped-def]
         slope: tangent of each pixel's elevation, (h, w); upright, far, found, same: as in ``walls_behind``.
         column_colour: colours of ``wall_colours``; fade: pixels; reach: largest number of columns that are searched.
         most: number of pixels that a common colour is the median of.
-        sure_share, sure_fade: opacity beside what is seen, and columns over which it falls by e.
-        colour: out, (h, w, 3) float32, −1 where nothing was found; sure: out, (h, w), 1 below what is seen of the wall.
+        sure_share, sure_fade: opacity beside a visible part, and columns over which it falls by e.
+        colour: result, (h, w, 3) float32; −1 where nothing was found.
+        sure: resulting opacity, (h, w); 1 below a visible part of the wall.
     """
     height, width = hole.shape
     some = np.empty((most, 3), np.float32)

@@ -82,13 +82,14 @@ def pull_push(values, weight, sizes, levels):  # type: ignore[no-untyped-def]
 def cut_tops(inverse, sigma, rgb, room, reach, step, assumed, contrast, share):  # type: ignore[no-untyped-def]
     """End the assumed tops of things where the image does: beyond, the surface above goes on.
 
-    A top is assumed where its depth is less sure than that of the thing below it. Its rows, from above, belong to what
-    is seen above it as long as their colour does.
+    A top is assumed where its depth is less certain than that of the thing below it. Its rows, from above, belong to
+    the surface above as long as they have that surface's colour.
 
     Args:
         inverse, sigma: inverse depth and its relative standard deviation, (h, w) float32; in and out.
         rgb: (h, w, 3) float32; room: (h, w) where pixels show surfaces.
-        reach: rows of a top, at most; step: a thing is nearer than what is above it by this factor.
+        reach: largest number of rows of a top.
+        step: factor by which a thing is nearer than the surface above it.
         assumed: sigma of an assumed depth, at least, and at least twice that of the thing.
         contrast: least difference of the colours of both; share: share of the thing's colour in a pixel of it.
     """

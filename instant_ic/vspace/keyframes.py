@@ -69,7 +69,7 @@ class KeyframeSet:
     Attributes:
         keyframes: keyframes that the field learns from together, newest first.
         gains: factors that bring each keyframe's colours to the newest's exposure, (K, 3).
-        kept: older keyframes, newest first, whose pixels show what is hidden from the newest.
+        kept: older keyframes, newest first, whose pixels show places hidden from the newest.
     """
 
     keyframes: tuple[Keyframe, ...]
@@ -94,7 +94,7 @@ def extended(prior: PanoramaPrior, shown: KeyframeSet | None, count: int, older:
         prior: the new keyframe.
         shown: keyframes in use before; None before the first.
         count: number of keyframes that the field learns from, in one exposure and without moved objects.
-        older: number of older keyframes that give their pixels of what is hidden from the new one.
+        older: number of older keyframes that give their pixels of places hidden from the new one.
     """
     before = () if shown is None else (*shown.keyframes, *shown.kept)
     size = (prior.rgb.shape, prior.inverse_depth.shape)
@@ -114,7 +114,7 @@ def extended(prior: PanoramaPrior, shown: KeyframeSet | None, count: int, older:
 
 
 def spread(keyframes: Sequence[Keyframe], count: int) -> list[Keyframe]:
-    """Choose the older keyframes that show most of what the newest does not see.
+    """Choose the older keyframes that show most of the places hidden from the newest.
 
     The farthest within ``REACH_M`` comes first, then those farthest from all chosen before, ``APART_M`` at least.
 

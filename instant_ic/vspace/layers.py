@@ -1,6 +1,6 @@
 """The virtual space as a stack of panoramic layers, which any renderer can show: encoding, and decoding to keyframes.
 
-Each keyframe gives two layers: what the camera saw, in the camera's own image, and what becomes visible behind it.
+Each keyframe gives two layers: the visible surfaces, in the camera's own image, and the hidden ones behind them.
 ``VspaceLayer.msg`` describes the encoding.
 """
 
@@ -66,7 +66,7 @@ class Layer:
 
 @dataclass(frozen=True)
 class Layers:
-    """One version of the space: what the newest keyframe has seen, and what lies behind it."""
+    """One version of the space: the newest keyframe's visible and hidden surfaces."""
 
     version: int
     layers: tuple[Layer, ...]
@@ -132,8 +132,8 @@ class DecodedLayer:
     Attributes:
         rgb: (H, 2 H, 3) uint8.
         inverse_depth: 1/m along the ray, (h, 2 h) float32.
-        content: ``Content``, (h, 2 h) uint8: of each pixel, or of the quad right of and below it (``BEHIND``).
-        confidence: 0..1, (h, 2 h) float32: below 1 the depth is filled from around; of a guess its share of an image.
+        content: ``Content`` of each pixel, or of the quad right of and below it (``BEHIND``), (h, 2 h) uint8.
+        confidence: 0 to 1, (h, 2 h) float32; below 1 the depth was filled. Of hidden surfaces: their opacity.
         edge: pixels whose quad, right of and below them, crosses a depth edge, (h, 2 h).
     """
 

@@ -34,7 +34,9 @@ def shade(  # type: ignore[no-untyped-def]
 
     Args:
         triangles ... texture: as in ``ColouredMesh``; texel_per_m ... levels: as in ``texel_pyramids``.
-        origin: (3,); directions: (P, 3); range_m, face: (P,), what each ray meets, face −1 for nothing.
+        origin: origin of the rays, (3,).
+        directions: their directions, (P, 3).
+        range_m, face: distance and triangle of each hit, (P,); face −1 without one.
         pixel_rad: angle of a pixel.
         colour: out, (P, 3) in 0..1; 0 where nothing is met.
     """

@@ -80,7 +80,7 @@ class MeshSpace(RayRenderer):
     ) -> None:
         """Compare the mesh with a panorama; with ``mesh_fit_colours``, fit one colour factor a channel.
 
-        Args: as ``prior.prepare``; ``relative_sigma`` counts for nothing here.
+        Args: as ``prior.prepare``; ``relative_sigma`` is not used.
 
         Raises:
             KeyframeError: no panorama, or a pose that is none; all stays as it was.

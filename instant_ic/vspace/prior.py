@@ -165,8 +165,8 @@ def prepare(
             the depth, not finite where it is unknown.
         config: geometry parameters.
         panorama_width: a wider panorama is area-averaged to this width.
-        robot: image (H, 2 H) of any size: true where the panorama shows the robot itself or its stand, besides what
-            lies below ``config.body_below_deg``.
+        robot: mask of any size, (H, 2 H), True where the panorama shows the robot itself or its stand; pixels below
+            ``config.body_below_deg`` are added.
 
     Raises:
         KeyframeError: wrong shape or type, values that are not finite, too little depth, a pose that is none.
@@ -360,8 +360,8 @@ def edge_quads(inverse_depth: NDArray[np.float32], ratio: float) -> NDArray[np.u
     """Return 1 for each quad (v, u)-(v + 1, u + 1) across a depth edge; columns wrap, the last row has no quads.
 
     Two neighbours are an edge when their depths differ by more than ``ratio`` and neither side's slope of the inverse
-    depth leads to the other: inverse depth is linear along a plane, however much the plane leans away. Where it leans
-    far, the noise of the depth is as large as what a pixel makes: there the step has to be most of the change around.
+    depth leads to the other: inverse depth is linear along a plane, however much the plane leans away. On a strongly
+    leaning plane, noise is as large as the change per pixel: there the step must be most of the change around.
     """
     inverse = inverse_depth.astype(np.float32)
     width = inverse.shape[1]

@@ -128,7 +128,7 @@ def _flatten(name: str, value: Any, arrays: Arrays) -> None:
 
 
 def _built(name: str, kind: Any, arrays: Arrays) -> Any:
-    """Build what ``_flatten`` has entered, by its type."""
+    """Build a value of type ``kind`` from the arrays of ``_flatten``."""
     if dataclasses.is_dataclass(kind):
         hints = get_type_hints(kind)
         return kind(**{field.name: _built(f"{name}.{field.name}", hints[field.name], arrays)

@@ -51,7 +51,7 @@ class SpaceStatus:
     """Status of the space; fields as in VspaceStatus.msg.
 
     Attributes:
-        state: what the space can show.
+        state: state of the space.
         refreshing: the field has not learnt the newest keyframe yet.
         psnr_db: PSNR of the training rays since the newest keyframe.
         iterations: iterations since the newest keyframe.
@@ -92,7 +92,7 @@ class TrainingRun:
 
     Args:
         config: parameters of the space.
-        refresh: the field goes on from what it has learnt.
+        refresh: the field starts from its present parameters.
         colour_error: squared colour error so far; NaN before the first iteration.
     """
 
@@ -130,7 +130,7 @@ class TrainingRun:
 class VirtualSpace(RayRenderer):
     """The newest keyframes, shown at once by warping, and one hash-grid field trained on all of them.
 
-    A new keyframe is shown from the moment it is taken; the field goes on from what it has learnt. One thread at a
+    A new keyframe is shown from the moment it is taken; the field goes on from its present parameters. One thread at a
     time. The same calls with the same seed give the same bits on the CPU, if training is limited by iterations.
 
     Attributes:
@@ -152,8 +152,8 @@ class VirtualSpace(RayRenderer):
 
         Args:
             config: parameters.
-            robot: image (H, 2 H): true where panoramas show the robot itself or its stand, besides what
-                ``config.geometry.body_below_deg`` says.
+            robot: mask, (H, 2 H), True where panoramas show the robot itself or its stand; pixels below
+                ``config.geometry.body_below_deg`` are added.
 
         Raises:
             ValueError: parameters that do not fit; DeviceError: a device that is not there.
@@ -230,7 +230,7 @@ class VirtualSpace(RayRenderer):
         """Prepare a new keyframe, with the earlier ones that are kept; changes nothing that is shown.
 
         The field learns from ``config.keyframes`` − 1 earlier keyframes too, in the new one's exposure and without
-        moved objects. ``config.older`` keyframes give their pixels of what is hidden from the new one. Keyframes of
+        moved objects. ``config.older`` keyframes give their pixels of places hidden from the new one. Keyframes of
         another size are dropped.
 
         Args: as ``prior.prepare``.
@@ -249,7 +249,7 @@ class VirtualSpace(RayRenderer):
 
         Args:
             prepared: keyframes of ``prepare``.
-            dissolve: what was shown before dissolves into them over the next ``view.refresh_views`` views.
+            dissolve: blend from the previous keyframe over the next ``view.refresh_views`` views.
         """
         self._before, self._views = self._shown if dissolve else None, 0
         self._shown = prepared

@@ -17,7 +17,7 @@ from instant_ic.vspace.prior import fill_holes
 MIN_VIEW, MAX_VIEW = 16, 4096
 """Pixels a side."""
 _SOFT, _SOFT_EDGE = 16, 7
-"""Pixels: those averaged for a guess, and the width of its edge."""
+"""Width in pixels of the averages in estimated parts, and of the transition to them."""
 _GREY = np.array([0.30, 0.59, 0.11], np.float32)
 _STRIDE_RAD = 0.025
 """In an equirect image the inverse depth of a plane is linear between pixels no further apart than about this."""
@@ -28,12 +28,12 @@ class View:
     """An image of the space.
 
     Attributes:
-        rgb: (H, W, 3) uint8; what is not known is continued from around it.
-        depth_m: (H, W) along the ray, 0 where it meets nothing.
-        confidence: (H, W): 1 where a keyframe has seen the place, 0.5 where it has but its depth was filled from
-            around, 0 where none has: unknown.
+        rgb: image, (H, W, 3) uint8; unknown parts are filled from their surroundings.
+        depth_m: metres along each ray, (H, W); 0 where it meets nothing.
+        confidence: 1 where a keyframe has seen the place, 0.5 where it has but its depth was filled, 0 where the place
+            is unknown, (H, W).
         projection: ``perspective`` or ``equirect``.
-        expected_psnr_db: that the image has, judged without its truth (``readiness``).
+        expected_psnr_db: estimated PSNR of the image (``readiness``).
     """
 
     rgb: NDArray[np.uint8]

@@ -101,8 +101,9 @@ def render_mesh(  # type: ignore[no-untyped-def]
     missing from the panorama's own position, and the edge opens from the side.
 
     Args:
-        vertices, outside: of ``place_vertices``; inverse, depth_edge, known: of the ``PanoramaPrior``, with a row more
-            above and below for the poles; known 2: nothing is rendered there.
+        vertices, outside: results of ``place_vertices``.
+        inverse, depth_edge, known: arrays of the ``PanoramaPrior`` with one more row above and below, for the poles;
+            nothing is rendered where known is 2.
         corners: unit vectors half a pixel up and left of each pixel, (h + 1, w, 3).
         nearness: in and out, (H, W): inverse of the depth along the view's axis, 0 where nothing is.
         marks: in and out, (H, W) uint8: ``EMPTY``, ``FILLED``, ``KNOWN`` or ``BEHIND``.

@@ -206,7 +206,7 @@ class SpaceWorker:
         self._waiting_keyframe: IncomingKeyframe | None = None
         self._waiting_view: ViewOrder | None = None
         self._busy = False
-        self._todo: deque[Job] = deque()  # what the shown keyframe still needs
+        self._todo: deque[Job] = deque()  # jobs that the shown keyframe still needs
         self._learns = False  # the field has something to learn
         self._ready_seconds: float | None = None  # from the keyframe's arrival until READY
         self._warned = False  # about the device
@@ -343,7 +343,7 @@ class SpaceWorker:
             self._ready_seconds = (self._now_ns() - self.keyframe.arrival_ns) / 1e9
 
     def _shown(self, keyframe: IncomingKeyframe) -> None:
-        """Note that a keyframe is shown, and what it still needs."""
+        """Note that a keyframe is shown, and the jobs that it still needs."""
         assert self.status is not None
         self.keyframe, self.failure, self._ready_seconds = keyframe, "", None
         self._todo.clear()

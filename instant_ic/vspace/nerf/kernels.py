@@ -120,9 +120,9 @@ def encode_block(  # type: ignore[no-untyped-def]
 
 @njit(**_OPTIONS)
 def encode_backward_block(table_grad, touched, entries, weights, count, dx):  # type: ignore[no-untyped-def]
-    """Add the gradient of a block's features ``dx`` to ``table_grad`` and marks the entries in ``touched``.
+    """Add the gradient of a block's features ``dx`` to ``table_grad``, and mark the entries in ``touched``.
 
-    ``entries``, ``weights``: of ``encode_block``; ``touched``: of ``no_marks``.
+    ``entries`` and ``weights`` come from ``encode_block``, ``touched`` from ``no_marks``.
     """
     levels, _, features = table_grad.shape
     for level in range(levels):
@@ -275,9 +275,8 @@ def adam_touched(  # type: ignore[no-untyped-def]
 ):
     """Update the entries that have a gradient by one Adam step; clear gradients and marks.
 
-    ``touched``: as ``encode_backward_block`` marks them; where there is no mark no entry is looked at. Other entries
-    keep value and moments, as in ``torch.optim.SparseAdam``. ``step_size`` (levels,) already holds the bias correction
-    of the step, ``lr · √(1 − β2ᵗ) / (1 − β1ᵗ)``.
+    Entries without a mark of ``encode_backward_block`` in ``touched`` are skipped; they keep value and moments, as in
+    ``torch.optim.SparseAdam``. ``step_size`` (levels,) includes the bias correction, ``lr · √(1 − β2ᵗ) / (1 − β1ᵗ)``.
     """
     levels, size, features = table.shape
     for level in range(levels):

@@ -77,7 +77,7 @@ def sample_rays(  # type: ignore[no-untyped-def]
         points: out, (2 N, 3). Rays go by tiles: 64 points on the surface, then 64 in the band.
         target: out, (2 N, 4): colour minus 0.5, the ray's for both; signed distance in units of the newest's band (in
             front positive).
-        weight: out, (2 N, 2): of the colour and of the distance, 0 where no ray may be sampled.
+        weight: resulting weights of colour and distance, (2 N, 2); 0 where no ray may be sampled.
     """
     h, w = inverse.shape[1:]
     tiles = columns // 8
@@ -162,7 +162,7 @@ def nearest_prior(x, y, z, inverse, depth_edge, known, camera_from_map, band, al
     Arguments as in ``trace``; ``all_agree``: compute the agreement (0 otherwise).
 
     Returns:
-        Signed distance in units of the newest's band, and what ``prior_agrees`` says (the best of all keyframes).
+        Signed distance in bands of the newest keyframe, and the best agreement of all (``prior_agrees``).
     """
     best, best_agrees, unit = np.float32(NOT_SEEN), 0, np.float32(1)
     seen_through = False
@@ -398,7 +398,7 @@ def panorama_pixels(x, y, z, height, width):  # type: ignore[no-untyped-def]
 def mix_panorama(  # type: ignore[no-untyped-def]
     rgb, inverse, depth_edge, known, camera_from_map, gains, band, origin, directions, depth, confidence, share, colour
 ):
-    """Mix the panorama's colour into that of surfaces which a keyframe has seen: of the newest that has.
+    """Mix in the panorama's colour of the newest keyframe that has seen each surface.
 
     Args:
         rgb, inverse, depth_edge, known, band: arrays of the ``PanoramaPrior``s, newest first, stacked: (K, …).
@@ -432,7 +432,7 @@ def interpolate_depth(depth, confidence, stride, tolerance, pixels):  # type: ig
     neighbours differ by more than ``tolerance``, or meet nothing, are listed in ``pixels`` and have to be traced.
 
     Returns:
-        How many are listed.
+        Number of listed pixels.
     """
     height, width = depth.shape
     count = 0

@@ -31,7 +31,7 @@ from instant_ic.vspace.nerf.field import (
 )
 from instant_ic.vspace.view import LensRays
 
-# Compiled kernels stay with what else the project keeps; has to be set before triton is imported.
+# Compiled kernels are cached with the project's other files. This must be set before triton is imported.
 os.environ.setdefault("TRITON_CACHE_DIR", str(paths.cache_dir() / "triton"))
 
 from instant_ic.vspace.nerf import triton_kernels as kernels
@@ -40,7 +40,7 @@ TRAIN_BLOCK = 64
 ENTRIES = 256
 """Table entries of one program of Adam; the smallest table has four times as many."""
 TILE = 64
-"""Rays of one program, 8 × 8: of a batch's stratum tile, and of an image."""
+"""Rays of one program: an 8 × 8 tile of a batch's strata or of a view."""
 
 
 @dataclass
