@@ -22,6 +22,7 @@ from instant_ic.depth.manifest import InferenceError
 from instant_ic.depth.sources import SOURCES, DepthResult, DepthSource, SourceConfig, complete, without_body
 from instant_ic.depth.visibility import nearest_points
 from instant_ic.geometry.projections import equirect_directions
+from instant_ic.lidar.capture import CaptureReader
 from instant_ic.lidar.stream import PacketStream
 
 DATA = Path(__file__).resolve().parents[2].parent / "shared" / "data"
@@ -115,7 +116,9 @@ def test_a_real_revolution_tells_the_ranges_that_it_was_not_shown() -> None:
     path = DATA / "vlp16" / "einride_recording.pcap"
     if not path.exists():
         pytest.skip(f"{path} is not there")
-    revolution = next(each for each in PacketStream().revolutions(path) if each.complete)
+    stream = PacketStream()
+    fed = (stream.feed(payload, stamp_ns) for stamp_ns, _, payload in CaptureReader(path))
+    revolution = next(each for each in fed if each is not None and each.complete)
     points = revolution.xyz.astype(np.float64) - [0, 0, 0.6]
     # Every fourth sector of three degrees is kept back.
     kept_back = (np.degrees(np.arctan2(points[:, 1], points[:, 0])) // 3) % 4 == 0
