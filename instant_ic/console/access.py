@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import hashlib
 import hmac
-import math
 import secrets
 import ssl
 from collections import OrderedDict
@@ -176,11 +175,6 @@ class Access:
         """Return the role of a cookie; None if it is unknown or expired."""
         found = self._sessions.get(_digest(cookie))
         return found[0] if found is not None and now_s < found[1] else None
-
-    def end_of_session_s(self, cookie: str) -> float:
-        """Return the time at which a cookie's sign-in expires; minus infinity if there is none."""
-        found = self._sessions.get(_digest(cookie))
-        return -math.inf if found is None else found[1]
 
     def close_session(self, cookie: str) -> None:
         """Sign a page out."""

@@ -147,20 +147,13 @@ class Pages:
         if len(self.sessions) == 1:
             self._backend.on_watched(True)
         sender: asyncio.Task[None] | None = None
-        expiry: asyncio.TimerHandle | None = None
         try:
             await socket.prepare(request)  # raises if the request is no WebSocket upgrade
             connection.keep(lambda: self._end_flood(session))
             self._greet(session)
             sender = asyncio.create_task(session.send_forever())
-            if self._access.required and cookie:
-                # 10 ms late: a timer that fires early would find the sign-in still valid.
-                at_s = self._access.end_of_session_s(cookie) + 0.01
-                expiry = asyncio.get_running_loop().call_at(at_s, self.end_signed_out)
             await self._read_forever(session)
         finally:
-            if expiry is not None:
-                expiry.cancel()
             self._drop(session)
             if sender is not None:
                 sender.cancel()
