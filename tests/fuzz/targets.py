@@ -221,7 +221,7 @@ def _theta_http() -> Target:
         client._session.cookies.clear()
         real, connection.create_connection = connection.create_connection, connected
         try:
-            client.state()
+            client.health()
         finally:
             connection.create_connection = real
             client.close()
