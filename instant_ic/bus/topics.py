@@ -53,9 +53,6 @@ class Subscription:
         self.callback = callback
         self.raw: RawSubscription  # set by the node right after construction
 
-    def close(self) -> None:
-        self.raw.close()
-
 
 class Latest:
     """The newest message of a topic, as long as it is fresh."""
