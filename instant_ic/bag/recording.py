@@ -14,7 +14,8 @@ import shutil
 import threading
 import time
 from collections import Counter, deque
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -220,11 +221,9 @@ class Recording:
     # -- the writing thread ------------------------------------------------------------------------
 
     def _run(self) -> None:
-        try:
+        with self._noting_failures():
             if not self._writer.files:
                 self._writer.create()
-        except BagError as error:
-            self._fail(FAILED, str(error))
         now = time.monotonic()
         due_s = {"space": now, "flush": now, "custom": now + _KEEP_CUSTOM_S, "sync": now + SYNC_S}
         while True:
@@ -233,22 +232,27 @@ class Recording:
                 message = self._queue.popleft() if self._queue else None
             if message is None and self._ended_s:
                 break
-            try:
+            with self._noting_failures():
                 self._work(due_s)
-                if message is not None:
-                    self._write(message)
-            except DiskFullError as error:
-                self._fail(DISK_FULL, str(error))
-            except BagError as error:
-                self._fail(FAILED, str(error))
-            except Exception as error:  # a bug here must not leave a recorder that only appears to record
-                log.exception("bag writer")
-                self._fail(FAILED, f"{type(error).__name__}: {error}")
             if message is not None:
+                with self._noting_failures():  # also after a failure above: it counts the message
+                    self._write(message)
                 with self._changed:
                     self._pending -= 1
                     self._pending_bytes -= len(message.payload)
         self._complete()
+
+    @contextmanager
+    def _noting_failures(self) -> Iterator[None]:
+        try:
+            yield
+        except DiskFullError as error:
+            self._fail(DISK_FULL, str(error))
+        except BagError as error:
+            self._fail(FAILED, str(error))
+        except Exception as error:  # a bug here must not leave a recorder that only appears to record
+            log.exception("bag writer")
+            self._fail(FAILED, f"{type(error).__name__}: {error}")
 
     def _write(self, message: BagMessage) -> None:
         if self._state != RECORDING:

@@ -315,13 +315,19 @@ def on_the_disk(path: Path) -> list[bytes]:
 
 
 @pytest.mark.parametrize(
-    ("error", "size", "end_fits"),
-    [(errno.ENOSPC, 100, True), (errno.ENOSPC, 300_000, False), (errno.EIO, 100, False)],
+    ("error", "size", "end_fits", "flush_s"),
+    [
+        (errno.ENOSPC, 100, True, 0.1),
+        (errno.ENOSPC, 3_000, True, 0.0),  # a flush before each message
+        (errno.ENOSPC, 300_000, False, 0.1),
+        (errno.EIO, 100, False, 0.1),
+    ],
 )
 def test_every_message_is_recorded_or_counted_whatever_the_disk_refuses(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: int, size: int, end_fits: bool
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: int, size: int, end_fits: bool, flush_s: float
 ) -> None:
     """On a full disk the messages of the chunk that was being written were neither."""
+    monkeypatch.setattr(recording, "FLUSH_S", flush_s)
     recorder, bag = make(tmp_path / "bag")
     refused = threading.Event()
     write = os.write
