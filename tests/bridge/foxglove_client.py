@@ -11,7 +11,6 @@ from live_nodes import LiveNode, Neighbour
 from websockets.sync.client import connect
 
 from instant_ic.bus import registry
-from instant_ic.bus.control import ControlServer
 from instant_ic.bus.node import Node
 from nodes.foxglove_bridge import FoxgloveBridgeConfig, FoxgloveBridgeNode
 
@@ -117,9 +116,8 @@ class FoxgloveWorld:
         return self.keep(Neighbour(self.run_dir, name))
 
     def running(self, node_class, config, name):
-        """A node with parameters and a control channel, as every process of the stack has one."""
+        """A node with parameters, in the registry as every process of the stack."""
         node = self.keep(LiveNode(self.run_dir, node_class, config, name)).node
-        self.keep(ControlServer(node, self.run_dir / "nodes" / f"{name}.sock"))
         claim = registry.Claim(self.run_dir / "nodes" / name, f"node {name}")
         self._open.callback(claim.release)
         claim.write({**node.describe(), "started_ns": 1})
