@@ -428,8 +428,8 @@ def test_a_recording_shows_what_later_panoramas_saw(tmp_path) -> None:
     options = Options(5, bag=tmp_path / "bag")
     units = reconstruction.units(options)
     assert [unit.arguments["number"] for unit in units] == [0, 1]
-    arguments = {**units[0].arguments, "sources": ["panorama", "depth-warp"], "panorama_width": 256}
-    found = reconstruction.measure(arguments)
+    small = {"panorama_width": 256, "size": [48, 32], "seconds": 0.1}
+    found = reconstruction.measure({**units[0].arguments, **small, "sources": ["panorama", "depth-warp"]})
     psnr = {(row["source"], row["distance_m"]): row["psnr_db"] for row in found["rows"]}
     assert set(psnr) == {(source, at) for source in ("panorama", "depth-warp") for at in (0.5, 1.0)}
     assert psnr["depth-warp", 0.5] > psnr["panorama", 0.5] + 3
@@ -438,12 +438,11 @@ def test_a_recording_shows_what_later_panoramas_saw(tmp_path) -> None:
     assert "recorded" in str(reconstruction.section(results, options).parts)
     (first, _) = environments.units(options)
     assert first.arguments["sources"] == ["ours", "fill", "panorama"]
-    given = {"panorama_width": 256, "images": False, "size": [48, 32]}
-    place = Result(first, environments.measure({**first.arguments, **given}), 1.0, 1.0)
+    place = Result(first, environments.measure({**first.arguments, **small, "images": False}), 1.0, 1.0)
     lost = environments.losses(place, "ours")
     assert lost["unseen"] is not None and lost["unseen"] >= 0 and lost["depth"] is lost["pose"] is None
     (trained, _) = training_time.units(Options(5, bag=tmp_path / "bag", quick=True))
-    rows = training_time.measure({**trained.arguments, "panorama_width": 256, "times_s": [0.05]})["rows"]
+    rows = training_time.measure({**trained.arguments, **small, "times_s": [0.05]})["rows"]
     assert {(row["source"], row["distance_m"]) for row in rows} == {
         (source, at) for source in ("ours", "field", "paper") for at in (0.0, 1.0)
     }
