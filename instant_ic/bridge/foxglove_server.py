@@ -95,19 +95,20 @@ class _Viewer:
         self.awake = asyncio.Event()
         self.texts: deque[str] = deque()
         self.subscriptions: dict[int, _Channel] = {}
-        self.dropped = 0
         self._transport = request.transport
         self._messages: deque[bytes] = deque()
         self._bytes = 0
 
-    def put(self, subscription: int, publish_ns: int, payload: bytes | memoryview) -> None:
-        """Queue a message; drop the oldest to make room."""
+    def put(self, subscription: int, publish_ns: int, payload: bytes | memoryview) -> int:
+        """Queue a message; drop the oldest to make room, and return how many."""
         frame = protocol.message_data(subscription, publish_ns, payload)
+        dropped = 0
         while self._messages and (len(self._messages) >= _BACKLOG or self._bytes + len(frame) > _MAX_BACKLOG_BYTES):
-            self.take()
-            self.dropped += 1
+            self._bytes -= len(self._messages.popleft())
+            dropped += 1
         self._messages.append(frame)
         self._bytes += len(frame)
+        return dropped
 
     def take(self) -> str | bytes | None:
         """Remove and return the next frame to send: texts first, then the oldest message."""
@@ -137,7 +138,8 @@ class _Channel:
 
     Attributes:
         id: number of the channel.
-        topic, type_name, schema: name of the topic, its type and the type's definition.
+        type_name: type of the topic.
+        advertisement: the channel as it is offered to viewers.
         watchers: subscription of each viewer.
         latched: publication time and payload of each publisher's newest message if the topic is latched, for viewers
             that come later.
@@ -145,23 +147,11 @@ class _Channel:
     """
 
     id: int
-    topic: str
     type_name: str
-    schema: str
+    advertisement: dict[str, Any]
     watchers: dict[_Viewer, int] = field(default_factory=dict)
     latched: dict[str, tuple[int, bytes]] = field(default_factory=dict)
     subscription: Subscription | None = None
-
-    def advertisement(self) -> dict[str, Any]:
-        """Return the channel as it is offered to viewers."""
-        return {
-            "id": self.id,
-            "topic": self.topic,
-            "encoding": "cdr",
-            "schemaName": self.type_name,
-            "schema": self.schema,
-            "schemaEncoding": "ros2msg",
-        }
 
 
 class FoxgloveServer:
@@ -174,6 +164,7 @@ class FoxgloveServer:
 
     Attributes:
         count: messages of the bus that were passed to viewers.
+        dropped: messages dropped because a viewer was too slow.
         refused: rejected requests: wrong Origin, Host or token, or too many viewers.
         refusal: reason of the last rejection.
         token: token that viewers need in the address; empty: none.
@@ -193,10 +184,9 @@ class FoxgloveServer:
         self._channels: dict[str, _Channel] = {}
         self._numbers = itertools.count(1)
         self._viewers: list[_Viewer] = []
-        self._dropped_before = 0
         self._flush_due = False
         self.wake = threading.Event()
-        self.count = self.refused = 0
+        self.count = self.dropped = self.refused = 0
         self.refusal = ""
         needed = sign_in_needed(config.sign_in, config.host, config.simulated)
         self.token = secrets.token_urlsafe(24) if needed else ""
@@ -225,12 +215,6 @@ class FoxgloveServer:
         """Offered topics."""
         return sorted(self._channels)
 
-    @property
-    def dropped(self) -> int:
-        """Messages dropped because a viewer was too slow."""
-        with self._lock:
-            return self._dropped_before + sum(viewer.dropped for viewer in self._viewers)
-
     def reconcile(self, present: Sequence[TopicInfo]) -> None:
         """Offer new topics, withdraw those that are gone, and subscribe only to topics with viewers."""
         wanted = {info.topic: info for info in present if self._choice.takes(info.topic)}
@@ -246,10 +230,19 @@ class FoxgloveServer:
         if not schema:
             self._node.diagnose(f"topic {topic}", ERROR, f"no definition of {type_name} here: not offered to Foxglove")
             return False
-        channel = _Channel(next(self._numbers), topic, type_name, schema)
+        number = next(self._numbers)
+        advertisement = {
+            "id": number,
+            "topic": topic,
+            "encoding": "cdr",
+            "schemaName": type_name,
+            "schema": schema,
+            "schemaEncoding": "ros2msg",
+        }
+        channel = _Channel(number, type_name, advertisement)
         with self._lock:
             self._channels[topic] = channel
-            self._to_all(protocol.text("advertise", channels=[channel.advertisement()]))
+            self._to_all(protocol.text("advertise", channels=[advertisement]))
         return True
 
     def _watch(self, channel: _Channel, info: TopicInfo) -> None:
@@ -292,7 +285,7 @@ class FoxgloveServer:
             if latched:
                 channel.latched[received.publisher] = (received.publish_ns, bytes(received.payload))
             for viewer, subscription in channel.watchers.items():
-                viewer.put(subscription, received.publish_ns, received.payload)
+                self.dropped += viewer.put(subscription, received.publish_ns, received.payload)
             self._flush_soon()
 
     def close(self) -> None:
@@ -377,7 +370,7 @@ class FoxgloveServer:
         await socket.prepare(request)
         viewer = _Viewer(socket, request)
         with self._lock:
-            channels = [channel.advertisement() for channel in self._channels.values()]
+            channels = [channel.advertisement for channel in self._channels.values()]
             info = {"name": "Instant IC", "capabilities": ["parameters"], "metadata": {}, "sessionId": str(id(self))}
             viewer.texts += (protocol.text("serverInfo", **info), protocol.text("advertise", channels=channels))
             self._viewers.append(viewer)
@@ -389,7 +382,6 @@ class FoxgloveServer:
             sender.cancel()
             with self._lock:
                 self._viewers.remove(viewer)
-                self._dropped_before += viewer.dropped
                 for subscription in list(viewer.subscriptions):
                     viewer.unsubscribe(subscription)
             self.wake.set()
