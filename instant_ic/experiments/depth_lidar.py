@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 Floats = NDArray[np.floating]
 AZIMUTHS = 900
-"""Azimuth steps per revolution: 0.4 degrees, as at 600 rpm."""
+"""Azimuth steps per revolution: 0.4 degrees, as at 1200 rpm; at 600 rpm the device has twice as many."""
 MIN_RANGE_M, MAX_RANGE_M = 0.4, 100.0
 
 
