@@ -162,7 +162,7 @@ class Recorder:
             raise ValueError(f"{self.bag.path} is being {doing} already")
         self.bag = self._open(_dated(self.path, name, "rec_"), lost_before=self.lost_by())
         for value in cache.latched():
-            self.bag.put(value)
+            self.bag.put(value, old=True)
         return self.bag.path
 
     def stop(self) -> Path:

@@ -136,12 +136,21 @@ class Recording:
         gone = self.not_written if self._error else None
         return f"{self._error}; not recorded: {counts_text(gone)}" if gone else self._error
 
-    def put(self, message: BagMessage) -> None:
-        """Queue a message; never waits. Latched values before the first other message get its stamp."""
+    def put(self, message: BagMessage, old: bool = False) -> None:
+        """Queue a message; never waits.
+
+        Latched values may be minutes old when a bag begins: they are held until the first other message, or the second
+        one of a publisher, and get its stamp.
+
+        Args:
+            message: the message.
+            old: it is a latched value from before the bag.
+        """
         if self._ended_s:
             return
         if not self._begun_ns:
-            if message.qos.latched:  # the value may be minutes old
+            source = (message.topic, message.publisher)
+            if old or (message.qos.latched and source not in {(held.topic, held.publisher) for held in self._held}):
                 self._held.append(message)
                 return
             self._begin(message.stamp_ns)

@@ -198,6 +198,18 @@ def test_old_latched_values_are_filed_under_the_beginning(tmp_path: Path) -> Non
         assert {t.topic: t.qos.name for t in reader.topics} == {"/estop": "latched", "/scan": "sensor"}
 
 
+def test_a_bag_of_latched_topics_alone_is_written_while_it_is_recorded(tmp_path: Path) -> None:
+    recorder, bag = make(tmp_path / "bag")
+    recorder.take("/estop", BOOL, NO, 5, "console")  # minutes before the recording
+    recorder.take("/estop", BOOL, NO, 6, "robot")
+    for second in (1, 2, 3):
+        recorder.take("/estop", BOOL, YES, second * S, "console")
+    wait_for(lambda: bag.status()["messages"] == 5, "the messages")
+    recorder.close()
+    stamps = [(payload == YES, stamp_ns // S) for _, stamp_ns, payload in read(tmp_path / "bag")]
+    assert stamps == [(False, 1), (False, 1), (True, 1), (True, 2), (True, 3)]
+
+
 def test_on_simulated_time_foreign_stamps_get_the_time_of_arrival(tmp_path: Path) -> None:
     now_ns = [0]
     recorder = Recorder(tmp_path / "bag", TopicChoice(), lambda topic, take: Losses(), lambda: now_ns[0])  # type: ignore[arg-type, return-value]
