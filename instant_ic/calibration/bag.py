@@ -67,23 +67,15 @@ class CalibrationCloud:
         return self.stamp_ns + round(0.5e9 * float(time.min() + time.max()))
 
 
-def read_recording(
-    path: Path, image_topic: str = "", points_topic: str = "", most_frames: int = 24
-) -> CalibrationRecording:
-    """Read a bag.
-
-    Args:
-        path: the bag.
-        image_topic: empty selects ``/camera/image/compressed``.
-        points_topic: empty selects ``/lidar/points``, otherwise ``/lidar/packets``.
-        most_frames: largest number of images.
+def read_recording(path: Path, most_frames: int = 24) -> CalibrationRecording:
+    """Read at most ``most_frames`` images of a bag, with a revolution of ``/lidar/points`` or ``/lidar/packets`` each.
 
     Raises:
         BagError: the path is not a bag, or the bag is damaged.
         CalibrationError: the bag lacks images or revolutions, or none of them coincide in time.
     """
     with BagReader(path) as bag:
-        image_topic = _choose(bag, (PICTURE,), image_topic, ("/camera/image/compressed",))
+        image_topic = _choose(bag, (PICTURE,), ("/camera/image/compressed",))
         transforms = _transforms(bag)
         stamps, camera = _stamps(bag, image_topic)
         moves = {_BASE, _ODOM} <= transforms.frames()
@@ -94,7 +86,7 @@ def read_recording(
         chosen, places = _places(stamps, odom_from, most_frames)
         if not chosen:
             raise CalibrationError(f"{path}: odometry on /tf does not overlap in time with the {len(stamps)} images")
-        clouds = _nearest_clouds(bag, points_topic, list(chosen))
+        clouds = _nearest_clouds(bag, list(chosen))
         frames = []
         for message in bag.messages([image_topic]):
             picture = deserialize(message.payload, message.type_name)
@@ -131,9 +123,9 @@ def _transforms(bag: BagReader) -> TransformBuffer:
     return buffer
 
 
-def _clouds(bag: BagReader, points_topic: str, near: Callable[[int], bool]) -> Iterator[CalibrationCloud]:
+def _clouds(bag: BagReader, near: Callable[[int], bool]) -> Iterator[CalibrationCloud]:
     """Yield the revolutions, from points or packets, for which ``near`` accepts the time (ns) of the message."""
-    topic = _choose(bag, (CLOUD, PACKETS), points_topic, ("/lidar/points", "/lidar/packets"))
+    topic = _choose(bag, (CLOUD, PACKETS), ("/lidar/points", "/lidar/packets"))
     stream = PacketStream()
     for message in bag.messages([topic]):
         if message.type_name == CLOUD:
@@ -148,18 +140,15 @@ def _clouds(bag: BagReader, points_topic: str, near: Callable[[int], bool]) -> I
                 yield CalibrationCloud(revolution.points, revolution.stamp_ns, scan.header.frame_id)
 
 
-def _choose(bag: BagReader, kinds: tuple[str, ...], wanted: str, usual: tuple[str, ...]) -> str:
+def _choose(bag: BagReader, kinds: tuple[str, ...], usual: tuple[str, ...]) -> str:
+    """Return the first of the usual topics, or the only one of these types."""
     types = {topic.topic: topic.type_name for topic in bag.topics}
-    found = sorted(topic for topic, kind in types.items() if kind in kinds)
-    names = " or ".join(kind.rsplit("/", 1)[-1] for kind in kinds)
-    if wanted and wanted not in found:
-        raise CalibrationError(
-            f"{bag.path}: no topic {wanted} of type {names}; available: {', '.join(found) or 'none'}"
-        )
-    choice = wanted or next((topic for topic in usual if topic in found), "") or (found[0] if len(found) == 1 else "")
+    found = [topic for topic, kind in types.items() if kind in kinds]
+    choice = next((topic for topic in usual if topic in found), found[0] if len(found) == 1 else "")
     if not choice:
-        there = f"select one of {', '.join(found)}" if found else f"topics of the bag: {', '.join(types) or 'none'}"
-        raise CalibrationError(f"{bag.path}: no {' or '.join(usual)} ({names}); {there}")
+        names = " or ".join(kind.rsplit("/", 1)[-1] for kind in kinds)
+        there = ", ".join(found or types) or "none"
+        raise CalibrationError(f"{bag.path}: no {' or '.join(usual)} ({names}); topics of the bag: {there}")
     return choice
 
 
@@ -222,13 +211,13 @@ def _evenly(values: list[int], most: int) -> list[int]:
     return [values[round(k)] for k in np.linspace(0, len(values) - 1, most)] if most else []
 
 
-def _nearest_clouds(bag: BagReader, topic: str, stamps: list[int]) -> dict[int, CalibrationCloud]:
+def _nearest_clouds(bag: BagReader, stamps: list[int]) -> dict[int, CalibrationCloud]:
     """Return the revolution nearest in time to each stamp, where one is near enough."""
     # The bag stamps messages on arrival, up to a second late on a busy machine.
     at = np.array(stamps)
     found: dict[int, CalibrationCloud] = {}
     count = 0
-    for cloud in _clouds(bag, topic, lambda ns: bool((np.abs(at - ns) < 1_500_000_000).any())):
+    for cloud in _clouds(bag, lambda ns: bool((np.abs(at - ns) < 1_500_000_000).any())):
         missing = [name for name in _FIELDS if name not in (cloud.points.dtype.names or ())]
         if missing:
             raise CalibrationError(f"{bag.path}: the points lack the field {', '.join(missing)}")

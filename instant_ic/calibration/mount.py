@@ -24,8 +24,8 @@ _SECTORS = 16
 AXES = ("x", "y", "z", "roll", "pitch", "yaw")
 _WEIGHTS = {"jump": 1.0, "shade": 1.0, "floor": 0.5, "shade_across": 0.25}
 _SYSTEMATIC = np.array([0.01] * 3 + [math.radians(0.1)] * 3)
-"""Systematic error that the scatter does not show: a skirting board in front of its wall, a rounded edge. Measured, see
-docs/benchmarks.md, Camera mount."""
+"""Systematic error that the scatter does not show: a skirting board in front of its wall, a rounded edge.
+Measured."""
 _PLACES_FOR_HEIGHT, _UNCHECKED_HEIGHT = 3, 5.0
 """With fewer places, the upper edge of a skirting board can pass for the foot of its wall; z then gets an additional
 standard deviation of this many units."""

@@ -33,8 +33,6 @@ def add_parser(subparsers: Any) -> None:
     add("-o", "--out", type=Path, default=Path("camera_mount.yaml"), metavar="FILE", help=text)
     add("--plot", type=Path, metavar="PNG", help="LiDAR points over the images, before and after")
     add("--json", type=Path, metavar="FILE", help="write the figures here")
-    add("--images", default="", metavar="TOPIC", help="images (default: /camera/image/compressed)")
-    add("--points", default="", metavar="TOPIC", help="LiDAR points (default: /lidar/points, else /lidar/packets)")
     add("--frames", type=positive_int, default=24, metavar="N", help="maximum number of images (%(default)s)")
     text = "initial camera pose in the LiDAR frame (m, degrees) if /tf_static lacks it"
     form = "X,Y,Z,ROLL,PITCH,YAW"
@@ -50,7 +48,7 @@ def camera_lidar(args: argparse.Namespace) -> int:
     guess = _guess(args.guess) if args.guess else None
     check_files(args.out, args.plot, args.json)
     print(f"reading {args.bag}", flush=True)
-    recording = read_recording(args.bag, args.images, args.points, args.frames)
+    recording = read_recording(args.bag, args.frames)
     given = guess if guess is not None else recording.camera_from_lidar
     if given is None:
         raise UserError(
