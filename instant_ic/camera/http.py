@@ -6,7 +6,6 @@ import io
 import math
 import socket
 import time
-from collections.abc import Mapping
 from typing import Any
 
 import requests
@@ -57,27 +56,6 @@ class DeviceSession(requests.Session):
 
     def get_redirect_target(self, resp: requests.Response) -> None:
         """Return None: redirects are neither followed nor read."""
-
-    def ask(self, method: str, url: str, body: Mapping[str, Any] | None, timeout_s: float) -> requests.Response:
-        """Send one request and read its reply; the parts of a multipart reply are left for streaming.
-
-        Args:
-            method: HTTP method.
-            url: complete address.
-            body: sent as JSON.
-            timeout_s: time-out of the connection and of the whole reply.
-
-        Raises:
-            requests.RequestException: no reply in time.
-            CameraError: the reply cannot come from a camera.
-        """
-        self.deadline_s = time.monotonic() + timeout_s
-        try:
-            return self.request(method, url, json=body, timeout=timeout_s, stream=True, allow_redirects=False)
-        except requests.RequestException:
-            raise
-        except (AttributeError, KeyError, ValueError) as error:  # raised by the digest of requests
-            raise CameraError(f"{url}: the camera's digest challenge cannot be answered ({error!r})") from error
 
 
 class _Adapter(HTTPAdapter):

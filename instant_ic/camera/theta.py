@@ -166,15 +166,20 @@ class ThetaClient:
         self, session: DeviceSession, method: str, path: str, body: Mapping[str, Any] | None, timeout_s: float
     ) -> requests.Response:
         """Send one request; repeat it with growing waits while the camera is busy."""
-        wait_s = self.config.busy_wait_s
+        wait_s, url = self.config.busy_wait_s, self.url + path
         for attempt in range(self.config.busy_retries + 1):
+            session.deadline_s = time.monotonic() + timeout_s
             try:
-                response = session.ask(method, self.url + path, body, timeout_s)
+                response = session.request(
+                    method, url, json=body, timeout=timeout_s, stream=True, allow_redirects=False
+                )
             except requests.RequestException as error:
                 raise CameraError(
-                    f"{self.url}{path}: no answer ({_cause(error)}). Check that the camera is on, in the same network, "
+                    f"{url}: no answer ({_cause(error)}). Check that the camera is on, in the same network, "
                     "and in the expected wireless mode."
                 ) from error
+            except (AttributeError, KeyError, ValueError) as error:  # raised by the digest of requests
+                raise CameraError(f"{url}: the camera's digest challenge cannot be answered ({error!r})") from error
             if response.status_code != 503:
                 break
             if attempt < self.config.busy_retries:
@@ -183,7 +188,7 @@ class ThetaClient:
                 wait_s *= 2.0
         if response.status_code == 200:
             return response
-        refusal = _refusal(self.url + path, body, response.status_code, _json(response) or {})
+        refusal = _refusal(url, body, response.status_code, _json(response) or {})
         response.close()
         raise refusal
 
