@@ -5,7 +5,9 @@ from __future__ import annotations
 import functools
 import os
 import sys
+import threading
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
 from pathlib import Path
 
@@ -13,7 +15,6 @@ from instant_ic.bus import registry
 from instant_ic.launch.description import LaunchDescription
 from instant_ic.launch.health import HealthMonitor, TopicFault
 from instant_ic.launch.node_table import NodeRow, heartbeat_row
-from instant_ic.launch.outlet import Outlet
 from instant_ic.launch.pacing import Pacing
 from instant_ic.launch.process import ManagedProcess, ProcessState
 from instant_ic.launch.rundir import stack_lock
@@ -23,6 +24,7 @@ from instant_ic.util.estop_state import RunMark
 from instant_ic.util.pace import PaceFiles, describe, remove_files
 
 _WAITING_LINES = 2000  # how many lines a terminal may lag behind
+_LAST_LINES_S = 2.0  # how long the end waits for a blocked terminal
 
 
 def run_stack(
@@ -82,38 +84,50 @@ def run_stack(
 
 
 class StackOutput:
-    """The screen, on a thread of its own so that a blocked terminal does not hold up the stack."""
+    """The screen, on a thread of its own.
+
+    A terminal stopped with Ctrl-S or a dead ssh connection must not hold up the threads that read the nodes' pipes, or
+    the nodes would block at their next line.
+    """
 
     def __init__(self, labels: Sequence[str], live: bool, verbose: bool) -> None:
         self.pacing: Pacing | None = None
         self._screen = StackScreen(labels, live, verbose=verbose)
-        self._outlet = Outlet(_WAITING_LINES)
-        self._outlet.put(self._screen.start, always=True)
+        self._printer = ThreadPoolExecutor(1, "screen")
+        self._room = threading.BoundedSemaphore(_WAITING_LINES)
+        self._view = self._printer.submit(self._screen.start)
 
     def node_line(self, node: str, text: str) -> None:
         """Show a line of a node, unless the terminal lags too far behind; the log has it."""
-        self._outlet.put(self._screen.node_line, node, text)
+        if self._room.acquire(blocking=False):
+            self._printer.submit(self._screen.node_line, node, text).add_done_callback(lambda _: self._room.release())
 
     def event(self, text: str, bad: bool = False) -> None:
         """Show an event of the launcher."""
-        self._outlet.put(self._screen.event, text, bad, always=True)
+        self._printer.submit(self._screen.event, text, bad)
 
     def refresh(self, processes: Sequence[ManagedProcess], health: HealthMonitor | None, ending: bool) -> None:
-        """Adapt the pace, and show the present state."""
+        """Adapt the pace, and show the present state, unless the last one waits for the terminal still."""
         if self.pacing is not None and health is not None and not ending:
             self.pacing.step(health)
-        pace = self.pacing.text if self.pacing is not None else ""
-        self._outlet.put(self._screen.refresh, stack_view(processes, health, ending, pace))
+        view = stack_view(processes, health, ending, self.pacing.text if self.pacing is not None else "")
+        if self._view.done():
+            error = self._view.exception()
+            if error is not None and not isinstance(error, OSError):
+                self.event(f"the state cannot be shown: {error!r}", bad=True)
+            self._view = self._printer.submit(self._screen.refresh, view)
 
     def close(self, status: int) -> None:
         """Show the remaining lines and remove the table; on a blocked terminal the process exits with ``status``."""
-        self._outlet.put(self._screen.stop, always=True)
-        if not self._outlet.close(timeout_s=2.0):
+        try:
+            self._printer.submit(self._screen.stop).result(_LAST_LINES_S)
+        except TimeoutError:
             # The blocked thread holds standard output, and the interpreter would wait for it forever. The nodes have
             # ended and the logs are written.
             os._exit(status)
-        if self._outlet.broken is not None:  # ic launch ... | head: the rest of the buffer has no destination
+        except OSError:  # ic launch ... | head: the rest of the buffer has no destination
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        self._printer.shutdown()
 
 
 def stack_view(

@@ -94,9 +94,14 @@ class StackScreen:
             self._live.start()
 
     def stop(self) -> None:
-        """Remove the table."""
+        """Remove the table.
+
+        Raises:
+            OSError: the terminal or the reader of standard output is gone.
+        """
         if self._live is not None:
             self._live.stop()
+        self._console.file.flush()
 
     def node_line(self, node: str, text: str) -> None:
         """Print a line of a node's output, if it is worth it."""
