@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
-from typing import Annotated, TypeAlias
+from typing import Annotated, ClassVar, TypeAlias
 
 from instant_ic.config.ranges import Checked, Percent, Positive, PositiveInt, Range, Share, check_ranges, require
 
@@ -17,14 +17,13 @@ class FieldConfig:
 
     Attributes:
         levels: hash-grid levels, coarse to fine.
-        features: features of a table entry, 2 or 4.
         log2_table: entries of a level, as a power of two; 18 for more detail and more memory.
         hidden: width of the network's hidden layer; wider than 32 does not compile for NVIDIA GPUs of capability 9.0.
         geometry: distance: a signed one; density: the paper's way, eight samples a pixel.
     """
 
     levels: Annotated[int, Range(1, 16)] = 8
-    features: Annotated[int, Range(2, 4)] = 4
+    features: ClassVar[int] = 4  # of a table entry
     log2_table: Annotated[int, Range(10, 22)] = 17
     hidden: Annotated[int, Range(4, 32)] = 32
     geometry: str = "distance"
@@ -32,11 +31,7 @@ class FieldConfig:
     def __post_init__(self) -> None:
         check_ranges(self)
         require(self, "geometry", self.geometry in ("distance", "density"), "distance or density")
-        require(self, "features", self.features in (2, 4), "2 or 4")
         require(self, "hidden", self.hidden % 4 == 0, "a multiple of 4")
-        inputs = self.levels * self.features
-        if inputs % 4 or inputs > 64:
-            raise ValueError(f"levels * features must be a multiple of 4 up to 64 (got {inputs})")
 
 
 @dataclass(frozen=True)

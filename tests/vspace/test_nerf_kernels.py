@@ -26,8 +26,8 @@ FOCUS = np.array(
 )  # pixels of 1 cm a metre: levels of 1 cm and less fade away
 
 
-def random_field(levels, features, hidden=16, log2_table=10, seed=3):
-    config = FieldConfig(levels=levels, features=features, hidden=hidden, log2_table=log2_table)
+def random_field(levels, hidden=16, log2_table=10, seed=3):
+    config = FieldConfig(levels=levels, hidden=hidden, log2_table=log2_table)
     p = FieldParameters.random(config, seed)
     rng = np.random.default_rng(seed)
     p.table[...] = rng.normal(size=p.table.shape)
@@ -48,9 +48,9 @@ def random_points(count, seed=5):
     return np.random.default_rng(seed).uniform(-4, 4, (count, 3)).astype(F)
 
 
-@pytest.mark.parametrize(("levels", "features", "count"), [(8, 4, 200), (8, 2, 64), (2, 2, 1)])
-def test_query_agrees_with_the_reference(levels, features, count):
-    p, lattice = random_field(levels, features)
+@pytest.mark.parametrize(("levels", "count"), [(8, 200), (8, 64), (2, 1)])
+def test_query_agrees_with_the_reference(levels, count):
+    p, lattice = random_field(levels)
     points = random_points(count)
     out = np.empty((count, 4), F)
     kernels.query(p.table, *p.network(), lattice.cells_per_m, lattice.origin, FOCUS, points, out)
@@ -71,9 +71,9 @@ def test_encoding_by_hand():
     assert x[:, 0] == pytest.approx([5.5] * 4)
 
 
-@pytest.mark.parametrize(("levels", "features", "count"), [(8, 4, 300), (4, 2, 70)])
-def test_gradient_agrees_with_autograd(levels, features, count):
-    p, lattice = random_field(levels, features)
+@pytest.mark.parametrize(("levels", "count"), [(8, 300), (4, 70)])
+def test_gradient_agrees_with_autograd(levels, count):
+    p, lattice = random_field(levels)
     points = random_points(count)
     rng = np.random.default_rng(0)
     target = rng.normal(size=(count, 4)).astype(F)

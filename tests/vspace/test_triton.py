@@ -75,9 +75,9 @@ def test_angles_agree_with_torch():
     assert torch.allclose(out, torch.atan2(y, x), atol=1e-6)
 
 
-@pytest.mark.parametrize(("levels", "features", "hidden"), [(2, 4, 16), (4, 2, 12)])
-def test_gradient_agrees_with_autograd(levels, features, hidden):
-    config = FieldConfig(levels=levels, features=features, hidden=hidden, log2_table=10)
+@pytest.mark.parametrize(("levels", "hidden"), [(2, 16), (3, 12)])
+def test_gradient_agrees_with_autograd(levels, hidden):
+    config = FieldConfig(levels=levels, hidden=hidden, log2_table=10)
     device = TritonDevice(config, TRAIN, DEVICE)
     rng = np.random.default_rng(3)
     p = FieldParameters.random(config, 3)
@@ -120,7 +120,7 @@ def test_gradient_agrees_with_autograd(levels, features, hidden):
 def test_a_gradient_by_hand():
     # One level in use: a point in the middle of a cell of 1 m, so that each of the eight corners has weight 1/8.
     # Network: hidden 0 = feature 0, the distance = hidden 0; so the distance is the mean of the corners' feature 0.
-    config = FieldConfig(levels=1, features=4, hidden=4, log2_table=10)
+    config = FieldConfig(levels=1, hidden=4, log2_table=10)
     device = TritonDevice(config, TRAIN, DEVICE)
     p = FieldParameters.random(config, 1)
     for array in (*p.network(), p.table):

@@ -19,11 +19,11 @@ import numpy as np
 from numba import njit
 
 from instant_ic.vspace.nerf.numba_cache import forget_stale
-from instant_ic.vspace.nerf.vectors import adam2, adam4, gather2, gather4, scatter2, scatter4
+from instant_ic.vspace.nerf.vectors import adam, gather, scatter
 
 BLOCK = 64
 MARKED = 4
-"""Number of table entries that share a mark: 64 bytes with four features, a cache line."""
+"""Number of table entries that share a mark: 64 bytes, a cache line."""
 _P1 = 2654435761
 _P2 = 805459861
 _OPTIONS: dict[str, Any] = {"cache": True, "nogil": True, "fastmath": True, "error_model": "numpy"}
@@ -110,12 +110,8 @@ def encode_block(  # type: ignore[no-untyped-def]
         at, by, values = entries[kept], weights[kept], table[level]
         cells_block(points, start, count, origin, cells_per_m[level], size, pixel, at, by)
         rows = x[level * features : (level + 1) * features]
-        if features == 4:
-            for i in range(count):
-                rows[0, i], rows[1, i], rows[2, i], rows[3, i] = gather4(values, of_point(at, i), of_point(by, i))
-        else:
-            for i in range(count):
-                rows[0, i], rows[1, i] = gather2(values, of_point(at, i), of_point(by, i))
+        for i in range(count):
+            rows[0, i], rows[1, i], rows[2, i], rows[3, i] = gather(values, of_point(at, i), of_point(by, i))
 
 
 @njit(**_OPTIONS)
@@ -128,12 +124,8 @@ def encode_backward_block(table_grad, touched, entries, weights, count, dx):  # 
     for level in range(levels):
         at, by, grad, marks = entries[level], weights[level], table_grad[level], touched[level]
         d = dx[level * features : (level + 1) * features]
-        if features == 4:
-            for i in range(count):
-                scatter4(grad, of_point(at, i), of_point(by, i), (d[0, i], d[1, i], d[2, i], d[3, i]))
-        else:
-            for i in range(count):
-                scatter2(grad, of_point(at, i), of_point(by, i), (d[0, i], d[1, i]))
+        for i in range(count):
+            scatter(grad, of_point(at, i), of_point(by, i), (d[0, i], d[1, i], d[2, i], d[3, i]))
         for corner in range(8):
             for i in range(count):
                 marks[at[corner, i] // np.uint32(MARKED)] = 1
@@ -278,7 +270,7 @@ def adam_touched(  # type: ignore[no-untyped-def]
     Entries without a mark of ``encode_backward_block`` in ``touched`` are skipped; they keep value and moments, as in
     ``torch.optim.SparseAdam``. ``step_size`` (levels,) includes the bias correction, ``lr · √(1 − β2ᵗ) / (1 − β1ᵗ)``.
     """
-    levels, size, features = table.shape
+    levels, size, _ = table.shape
     for level in range(levels):
         step, marks = step_size[level], touched[level]
         rows, grad, mean, square = table[level], table_grad[level], m[level], v[level]
@@ -287,8 +279,5 @@ def adam_touched(  # type: ignore[no-untyped-def]
                 continue
             marks[group] = 0
             for entry in range(group * MARKED, (group + 1) * MARKED):
-                if features == 4:
-                    if grad[entry, 0] != 0 or grad[entry, 1] != 0 or grad[entry, 2] != 0 or grad[entry, 3] != 0:
-                        adam4(rows, grad, mean, square, np.uint32(entry), step, beta1, beta2, epsilon)
-                elif grad[entry, 0] != 0 or grad[entry, 1] != 0:
-                    adam2(rows, grad, mean, square, np.uint32(entry), step, beta1, beta2, epsilon)
+                if grad[entry, 0] != 0 or grad[entry, 1] != 0 or grad[entry, 2] != 0 or grad[entry, 3] != 0:
+                    adam(rows, grad, mean, square, np.uint32(entry), step, beta1, beta2, epsilon)

@@ -1,15 +1,14 @@
 """Operations on table entries as machine vectors, which numba does not produce by itself (intrinsics in LLVM IR).
 
-``gather2``, ``gather4`` (rows, entries, weights) → tuple of 2 or 4 float32:
+``gather`` (rows, entries, weights) → tuple of 4 float32:
     ``Σ weights[c] · rows[entries[c]]`` over the eight corners of a cell.
-``scatter2``, ``scatter4`` (rows, entries, weights, upstream):
+``scatter`` (rows, entries, weights, upstream):
     ``rows[entries[c]] += weights[c] · upstream``, corner by corner.
-
-``adam2``, ``adam4`` (rows, grad, m, v, entry, step, beta1, beta2, epsilon):
+``adam`` (rows, grad, m, v, entry, step, beta1, beta2, epsilon):
     one step of Adam on ``rows[entry]`` and its moments, all of ``rows``' shape; clears ``grad[entry]``.
 
-``rows`` (size, features) float32, C-contiguous, with as many features as the function's name says; ``entries`` and
-``weights`` are tuples of eight uint32 and eight float32; ``upstream`` one of 2 or 4 float32. Nothing is checked.
+``rows`` (size, 4) float32, C-contiguous; ``entries`` and ``weights`` are tuples of eight uint32 and eight float32;
+``upstream`` one of 4 float32. Nothing is checked.
 """
 
 from __future__ import annotations
@@ -24,104 +23,89 @@ from numba.extending import intrinsic
 _CORNERS = 8
 _FAST = ("fast",)
 _LONG, _INT, _FLOAT = ir.IntType(64), ir.IntType(32), ir.FloatType()
+_FEATURES = 4
+_VECTOR = ir.VectorType(_FLOAT, _FEATURES)
 
 
-def _vector(features: int) -> ir.VectorType:
-    return ir.VectorType(_FLOAT, features)
-
-
-def _row(features: int, context: Any, builder: Any, kind: Any, rows: Any, entry: Any) -> Any:
+def _row(context: Any, builder: Any, kind: Any, rows: Any, entry: Any) -> Any:
     """Emit the pointer to a table's row."""
-    first = builder.mul(builder.zext(entry, _LONG), _LONG(features))
+    first = builder.mul(builder.zext(entry, _LONG), _LONG(_FEATURES))
     data = context.make_array(kind)(context, builder, rows).data
-    return builder.bitcast(builder.gep(data, [first]), _vector(features).as_pointer())
+    return builder.bitcast(builder.gep(data, [first]), _VECTOR.as_pointer())
 
 
 def _filled(builder: Any, scalars: list[Any]) -> Any:
     """Emit a vector of scalars."""
-    value = ir.Constant(_vector(len(scalars)), ir.Undefined)
+    value = ir.Constant(_VECTOR, ir.Undefined)
     for place, scalar in enumerate(scalars):
         value = builder.insert_element(value, scalar, _INT(place))
     return value
 
 
-def _weighted(features: int, builder: Any, weights: Any, corner: int, value: Any) -> Any:
+def _weighted(builder: Any, weights: Any, corner: int, value: Any) -> Any:
     """Emit ``weights[corner] · value``."""
-    weight = _filled(builder, [builder.extract_value(weights, corner)] * features)
+    weight = _filled(builder, [builder.extract_value(weights, corner)] * _FEATURES)
     return builder.fmul(value, weight, flags=_FAST)
 
 
-def _gather(features: int) -> Any:
-    """Make the intrinsic ``gather`` for tables of ``features``."""
-
-    @intrinsic
-    def gather(_typing: Any, rows: Any, entries: Any, weights: Any) -> Any:
-        def code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-            total = ir.Constant(_vector(features), [0.0] * features)
-            for corner in range(_CORNERS):
-                entry = builder.extract_value(args[1], corner)
-                place = _row(features, context, builder, signature.args[0], args[0], entry)
-                value = _weighted(features, builder, args[2], corner, builder.load(place, align=4))
-                total = builder.fadd(total, value, flags=_FAST)
-            parts = [builder.extract_element(total, _INT(place)) for place in range(features)]
-            return context.make_tuple(builder, signature.return_type, parts)
-
-        return types.UniTuple(types.float32, features)(rows, entries, weights), code
-
-    return gather
+def _mixed(builder: Any, kept: Any, new: Any, share: Any) -> Any:
+    """Emit ``new + share · (kept − new)``."""
+    change = builder.fmul(share, builder.fsub(kept, new, flags=_FAST), flags=_FAST)
+    return builder.fadd(new, change, flags=_FAST)
 
 
-def _scatter(features: int) -> Any:
-    """Make the intrinsic ``scatter`` for tables of ``features``."""
+@intrinsic
+def gather(_typing: Any, rows: Any, entries: Any, weights: Any) -> Any:
+    """Emit the weighted sum of a cell's corners."""
 
-    @intrinsic
-    def scatter(_typing: Any, rows: Any, entries: Any, weights: Any, upstream: Any) -> Any:
-        def code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-            value = _filled(builder, [builder.extract_value(args[3], place) for place in range(features)])
-            for corner in range(_CORNERS):
-                entry = builder.extract_value(args[1], corner)
-                place = _row(features, context, builder, signature.args[0], args[0], entry)
-                added = _weighted(features, builder, args[2], corner, value)
-                builder.store(builder.fadd(builder.load(place, align=4), added, flags=_FAST), place, align=4)
-            return context.get_dummy_value()
+    def code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        total = ir.Constant(_VECTOR, [0.0] * _FEATURES)
+        for corner in range(_CORNERS):
+            entry = builder.extract_value(args[1], corner)
+            place = _row(context, builder, signature.args[0], args[0], entry)
+            value = _weighted(builder, args[2], corner, builder.load(place, align=4))
+            total = builder.fadd(total, value, flags=_FAST)
+        parts = [builder.extract_element(total, _INT(place)) for place in range(_FEATURES)]
+        return context.make_tuple(builder, signature.return_type, parts)
 
-        return types.void(rows, entries, weights, upstream), code
-
-    return scatter
+    return types.UniTuple(types.float32, _FEATURES)(rows, entries, weights), code
 
 
-def _adam(features: int) -> Any:
-    """Make the intrinsic ``adam`` for tables of ``features``."""
-    vector = _vector(features)
+@intrinsic
+def scatter(_typing: Any, rows: Any, entries: Any, weights: Any, upstream: Any) -> Any:
+    """Emit the addition of a gradient to a cell's corners."""
 
-    def mixed(builder: Any, kept: Any, new: Any, share: Any) -> Any:
-        """Emit ``new + share · (kept − new)``."""
-        change = builder.fmul(share, builder.fsub(kept, new, flags=_FAST), flags=_FAST)
-        return builder.fadd(new, change, flags=_FAST)
+    def code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        value = _filled(builder, [builder.extract_value(args[3], place) for place in range(_FEATURES)])
+        for corner in range(_CORNERS):
+            entry = builder.extract_value(args[1], corner)
+            place = _row(context, builder, signature.args[0], args[0], entry)
+            added = _weighted(builder, args[2], corner, value)
+            builder.store(builder.fadd(builder.load(place, align=4), added, flags=_FAST), place, align=4)
+        return context.get_dummy_value()
 
-    @intrinsic
-    def adam(
-        _typing: Any, rows: Any, grad: Any, m: Any, v: Any, entry: Any, step: Any, beta1: Any, beta2: Any, epsilon: Any
-    ) -> Any:
-        def code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-            places = [_row(features, context, builder, signature.args[n], args[n], args[4]) for n in range(4)]
-            value, slope, mean, square = (builder.load(place, align=4) for place in places)
-            step, beta1, beta2, epsilon = (_filled(builder, [scalar] * features) for scalar in args[5:])
-            mean = mixed(builder, mean, slope, beta1)
-            square = mixed(builder, square, builder.fmul(slope, slope, flags=_FAST), beta2)
-            name, kind = f"llvm.sqrt.v{features}f32", ir.FunctionType(vector, [vector])
-            root = builder.call(get_or_insert_function(builder.module, kind, name), [square])
-            ratio = builder.fdiv(mean, builder.fadd(root, epsilon, flags=_FAST), flags=_FAST)
-            value = builder.fsub(value, builder.fmul(step, ratio, flags=_FAST), flags=_FAST)
-            zero = ir.Constant(vector, [0.0] * features)
-            for place, stored in zip(places, (value, zero, mean, square), strict=True):
-                builder.store(stored, place, align=4)
-            return context.get_dummy_value()
-
-        return types.void(rows, grad, m, v, types.uint32, step, beta1, beta2, epsilon), code
-
-    return adam
+    return types.void(rows, entries, weights, upstream), code
 
 
-gather2, scatter2, adam2 = _gather(2), _scatter(2), _adam(2)
-gather4, scatter4, adam4 = _gather(4), _scatter(4), _adam(4)
+@intrinsic
+def adam(
+    _typing: Any, rows: Any, grad: Any, m: Any, v: Any, entry: Any, step: Any, beta1: Any, beta2: Any, epsilon: Any
+) -> Any:
+    """Emit one step of Adam on an entry."""
+
+    def code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        places = [_row(context, builder, signature.args[n], args[n], args[4]) for n in range(4)]
+        value, slope, mean, square = (builder.load(place, align=4) for place in places)
+        step, beta1, beta2, epsilon = (_filled(builder, [scalar] * _FEATURES) for scalar in args[5:])
+        mean = _mixed(builder, mean, slope, beta1)
+        square = _mixed(builder, square, builder.fmul(slope, slope, flags=_FAST), beta2)
+        name, kind = f"llvm.sqrt.v{_FEATURES}f32", ir.FunctionType(_VECTOR, [_VECTOR])
+        root = builder.call(get_or_insert_function(builder.module, kind, name), [square])
+        ratio = builder.fdiv(mean, builder.fadd(root, epsilon, flags=_FAST), flags=_FAST)
+        value = builder.fsub(value, builder.fmul(step, ratio, flags=_FAST), flags=_FAST)
+        zero = ir.Constant(_VECTOR, [0.0] * _FEATURES)
+        for place, stored in zip(places, (value, zero, mean, square), strict=True):
+            builder.store(stored, place, align=4)
+        return context.get_dummy_value()
+
+    return types.void(rows, grad, m, v, types.uint32, step, beta1, beta2, epsilon), code
