@@ -136,13 +136,9 @@ class DepthScaler:
         config = self.config
         rows, columns, range_m = self._visible(points, *depth.shape)
         usable = _is_known(depth[rows, columns])
-        if int(usable.sum()) < config.min_points:
-            raise ScaleError(f"{int(usable.sum())} LiDAR points fall on known depth, {config.min_points} are needed")
+        self._check_points(int(np.count_nonzero(usable)), "fall on known depth")
         usable &= ~on_depth_edge(depth, rows, columns)
-        if int(usable.sum()) < config.min_points:
-            raise ScaleError(
-                f"{int(usable.sum())} LiDAR points fall off the depth's edges, {config.min_points} are needed"
-            )
+        self._check_points(int(np.count_nonzero(usable)), "fall off the depth's edges")
         rows, columns, range_m = rows[usable], columns[usable], range_m[usable]
         _check_azimuth(columns, depth.shape[1])
         at_points = depth[rows, columns]
@@ -167,16 +163,16 @@ class DepthScaler:
             message = f"{problem}; {message}"
         return ScaleFit(not problem, scale, self._clean(metres), quality, sigma, len(range_m), message)
 
+    def _check_points(self, count: int, where: str) -> None:
+        if count < self.config.min_points:
+            raise ScaleError(f"{count} LiDAR points {where}, {self.config.min_points} are needed")
+
     def _visible(self, points: Floats, height: int, width: int) -> tuple[NDArray[np.intp], NDArray[np.intp], Floats]:
         config = self.config
         points = points[np.isfinite(points).all(axis=1)]
         distance = np.linalg.norm(points, axis=1)
         points = points[(distance >= config.min_range_m) & (distance <= config.max_range_m)]
-        if len(points) < config.min_points:
-            raise ScaleError(
-                f"{len(points)} LiDAR points between {config.min_range_m} and {config.max_range_m} m, "
-                f"{config.min_points} are needed"
-            )
+        self._check_points(len(points), f"between {config.min_range_m} and {config.max_range_m} m")
         rows, columns, range_m = nearest_points(points[~hidden(points)], width, height)
         _check_azimuth(columns, width)
         return rows, columns, range_m
