@@ -232,10 +232,23 @@ def bake_mesh(world: World) -> None:
                 total += np.minimum(distance / _AMBIENT_REACH_M, 1.0) * (0.75 + 0.25 * direction[:, 2])
             best = np.maximum(best, total / _MESH_RAYS)
         value[:, corner] = 0.20 + 0.85 * best
-    # Affine function on the triangle's plane through the values at its corners, constant along the normal.
-    edges = np.stack([triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]], axis=1)
-    rise = np.stack([value[:, 1] - value[:, 0], value[:, 2] - value[:, 0]], axis=1)
-    gram = np.einsum("nij,nkj->nik", edges, edges) + 1e-9 * np.eye(2)
-    gradient = np.einsum("nij,ni->nj", edges, np.linalg.solve(gram, rise[..., None])[..., 0])
-    world.light_linear[:, :3] = gradient
-    world.light_linear[:, 3] = value[:, 0] - np.einsum("ni,ni->n", gradient, triangles[:, 0])
+    world.light_linear[:] = affine_on_triangles(triangles, value[..., None])[:, 0]
+
+
+def affine_on_triangles(triangles: npt.NDArray[np.float64], values: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    """Return the affine functions of a point that have the given values at the corners, constant along the normal.
+
+    Args:
+        triangles: corners in metres, (F, 3, 3).
+        values: C values at each corner, (F, 3, C).
+
+    Returns:
+        Coefficients of (x, y, z, 1), (F, C, 4).
+    """
+    edges, change = triangles[:, 1:] - triangles[:, :1], values[:, 1:] - values[:, :1]
+    gram = np.einsum("nij,nkj->nik", edges, edges)
+    gram += (1e-9 * np.trace(gram, axis1=1, axis2=2) + 1e-18)[:, None, None] * np.eye(2)
+    result = np.zeros((len(triangles), values.shape[2], 4))
+    result[:, :, :3] = np.einsum("nij,nik->nkj", np.linalg.solve(gram, edges), change)
+    result[:, :, 3] = values[:, 0] - np.einsum("nkj,nj->nk", result[:, :, :3], triangles[:, 0])
+    return result

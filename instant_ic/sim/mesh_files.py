@@ -7,22 +7,9 @@ import numpy.typing as npt
 
 from instant_ic.geometry.colour import srgb_to_linear
 from instant_ic.geometry.mesh_file import doubled_areas, load_mesh
-from instant_ic.sim.lighting import bake_mesh
+from instant_ic.sim.lighting import affine_on_triangles, bake_mesh
 from instant_ic.sim.textures import texture_set
 from instant_ic.sim.world import World
-
-
-def _affine_uv(triangles: npt.NDArray[np.float64], uv: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
-    """Return the affine maps (F, 2, 4) from points on triangles (F, 3, 3) to their texture coordinates (F, 3, 2)."""
-    edges = np.stack([triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]], axis=1)
-    change = np.stack([uv[:, 1] - uv[:, 0], uv[:, 2] - uv[:, 0]], axis=1)
-    gram = np.einsum("nij,nkj->nik", edges, edges)
-    gram += (1e-9 * np.trace(gram, axis1=1, axis2=2) + 1e-18)[:, None, None] * np.eye(2)
-    weights = np.linalg.solve(gram, edges)
-    result = np.zeros((len(triangles), 2, 4))
-    result[:, :, :3] = np.einsum("nij,nik->nkj", weights, change)
-    result[:, :, 3] = uv[:, 0] - np.einsum("nkj,nj->nk", result[:, :, :3], triangles[:, 0])
-    return result
 
 
 def _spawn(world: World) -> tuple[float, float, float]:
@@ -65,7 +52,7 @@ def load_world(path: str | Path) -> World:
         face_surface=np.arange(count, dtype=np.int32),
         normal=normal.astype(np.float32),
         offset=np.einsum("ni,ni->n", normal, triangles[:, 0]).astype(np.float32),
-        uv=_affine_uv(triangles, mesh.corner_uv.astype(np.float64)).astype(np.float32),
+        uv=affine_on_triangles(triangles, mesh.corner_uv.astype(np.float64)).astype(np.float32),
         texture=np.where(mesh.texture < 0, len(images), mesh.texture).astype(np.int32),
         tint=tint.astype(np.float32),
         emission=np.zeros(count, np.float32),
