@@ -8,7 +8,8 @@ from typing import Any
 
 from instant_ic.bag import BagError
 from instant_ic.bag.choice import TopicChoice
-from instant_ic.bag.recorder import BagRecorderConfig, Recorder, TakeMessage
+from instant_ic.bag.recorder import Recorder, TakeMessage
+from instant_ic.bag.recording import BagRecorderConfig
 from instant_ic.bus import RECORD, Node, NodeError, main
 from instant_ic.bus.registry import NodeInfo, TopicWatch, list_nodes
 from instant_ic.bus.transport import Received, Stats

@@ -12,19 +12,17 @@ import shutil
 import time
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Mapping
-from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 from instant_ic.bag.choice import TopicChoice
 from instant_ic.bag.message import BagError, BagMessage
-from instant_ic.bag.recording import ENDING, RECORDING, BagOptions, Recording, counts_text, low_text
+from instant_ic.bag.recording import ENDING, RECORDING, BagRecorderConfig, Recording, counts_text, low_text
 from instant_ic.bag.snapshot import SnapshotCache
 from instant_ic.bus.qos import PRESETS, SENSOR, QoS
 from instant_ic.bus.registry import NodeInfo, TopicInfo
 from instant_ic.bus.transport import Stats
-from instant_ic.config.ranges import NotNegative, Positive, PositiveInt, Range
 from instant_ic.util.diagnosis import Diagnosis, Level, RecentCount
 
 FOREIGN_CLOCK_NS = 10_000_000_000
@@ -37,40 +35,6 @@ _IDLE = "idle"
 TakeMessage = Callable[..., None]
 """Accepts ``(topic, type_name, payload, publish_ns, publisher)``; see :meth:`Recorder.take`."""
 Subscribe = Callable[[str, TakeMessage], Stats]
-
-
-@dataclass(frozen=True)
-class BagRecorderConfig(BagOptions):
-    """Parameters of ``bag_recorder``, in addition to those of writing.
-
-    Attributes:
-        snapshot: keep the last seconds in memory and write only on request (``ic bag snapshot``, emergency stop).
-            Between the commands ``record`` and ``stop`` (the page's button) it records into a bag of its own.
-        snapshot_seconds: seconds before the request that a snapshot holds.
-        max_cache_mb: memory for the last seconds, MB; with more traffic the snapshot is shorter.
-        path: folder of the bag, which must not exist; empty creates ``runs/bag_DATE_TIME`` in the working directory. In
-            snapshot mode, the folder for the snapshots.
-        topics: names or patterns of the topics to record; empty records everything.
-        exclude: names or patterns of the topics to leave out.
-        discovery_period_s: seconds between searches for new topics.
-        duration_s: seconds after which recording ends; 0 records until stopped.
-        snapshot_after_s: seconds after the request that a snapshot also holds.
-    """
-
-    snapshot: bool = False
-    snapshot_seconds: Positive = 30.0
-    max_cache_mb: PositiveInt = 256
-    path: str = ""
-    topics: tuple[str, ...] = ()
-    exclude: tuple[str, ...] = ()
-    discovery_period_s: Annotated[float, Range(0.01, 10.0)] = 0.2
-    duration_s: NotNegative = 0.0
-    snapshot_after_s: NotNegative = 2.0
-
-    def folder(self) -> Path:
-        if self.path:
-            return Path(self.path).expanduser()
-        return Path("runs") / f"{'snapshots' if self.snapshot else 'bag'}_{datetime.now():%Y%m%d_%H%M%S}"
 
 
 class Recorder:

@@ -17,12 +17,13 @@ from collections import Counter, deque
 from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from datetime import datetime
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 from instant_ic.bag.message import BagError, BagMessage, DiskFullError
 from instant_ic.bag.writer import BagWriter
-from instant_ic.config.ranges import Checked, NotNegative, NotNegativeInt, PositiveInt
+from instant_ic.config.ranges import Checked, NotNegative, NotNegativeInt, Positive, PositiveInt, Range
 
 FLUSH_S = 1.0
 """Longest time of the recording that a killed recorder loses."""
@@ -43,8 +44,8 @@ log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
-class BagOptions(Checked):
-    """How a bag is written.
+class BagRecorderConfig(Checked):
+    """Parameters of ``bag_recorder``.
 
     Attributes:
         compressed: compress with zstd.
@@ -52,6 +53,17 @@ class BagOptions(Checked):
         max_bag_duration: length in seconds at which the next file begins; 0 writes one file.
         queue_mb: largest queue for the disk, MB; messages beyond it are dropped and counted.
         min_free_mb: stop recording when the disk has less free space, MB.
+        snapshot: keep the last seconds in memory and write only on request (``ic bag snapshot``, emergency stop).
+            Between the commands ``record`` and ``stop`` (the page's button) it records into a bag of its own.
+        snapshot_seconds: seconds before the request that a snapshot holds.
+        max_cache_mb: memory for the last seconds, MB; with more traffic the snapshot is shorter.
+        path: folder of the bag, which must not exist; empty creates ``runs/bag_DATE_TIME`` in the working directory. In
+            snapshot mode, the folder for the snapshots.
+        topics: names or patterns of the topics to record; empty records everything.
+        exclude: names or patterns of the topics to leave out.
+        discovery_period_s: seconds between searches for new topics.
+        duration_s: seconds after which recording ends; 0 records until stopped.
+        snapshot_after_s: seconds after the request that a snapshot also holds.
     """
 
     compressed: bool = False
@@ -59,6 +71,20 @@ class BagOptions(Checked):
     max_bag_duration: NotNegative = 0.0
     queue_mb: PositiveInt = 256
     min_free_mb: NotNegativeInt = 100
+    snapshot: bool = False
+    snapshot_seconds: Positive = 30.0
+    max_cache_mb: PositiveInt = 256
+    path: str = ""
+    topics: tuple[str, ...] = ()
+    exclude: tuple[str, ...] = ()
+    discovery_period_s: Annotated[float, Range(0.01, 10.0)] = 0.2
+    duration_s: NotNegative = 0.0
+    snapshot_after_s: NotNegative = 2.0
+
+    def folder(self) -> Path:
+        if self.path:
+            return Path(self.path).expanduser()
+        return Path("runs") / f"{'snapshots' if self.snapshot else 'bag'}_{datetime.now():%Y%m%d_%H%M%S}"
 
 
 class Recording:
@@ -83,7 +109,7 @@ class Recording:
     def __init__(
         self,
         path: Path,
-        options: BagOptions,
+        options: BagRecorderConfig,
         custom: Callable[[], Mapping[str, Any]],
         content: Collection[BagMessage] = (),
         until_s: float = math.inf,

@@ -16,8 +16,8 @@ import pytest
 from instant_ic.bag import BagError, BagMessage, BagReader, recording
 from instant_ic.bag.choice import TopicChoice
 from instant_ic.bag.mcap_scan import McapScan
-from instant_ic.bag.recorder import BagRecorderConfig, Recorder
-from instant_ic.bag.recording import DISK_FULL, ENDED, FAILED, RECORDING, Recording
+from instant_ic.bag.recorder import Recorder
+from instant_ic.bag.recording import DISK_FULL, ENDED, FAILED, RECORDING, BagRecorderConfig, Recording
 from instant_ic.bag.snapshot import SnapshotCache
 from instant_ic.bus import LATCHED, RELIABLE, SENSOR
 from instant_ic.bus.qos import QoS

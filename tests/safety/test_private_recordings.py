@@ -8,7 +8,8 @@ from pathlib import Path
 import pytest
 
 from instant_ic.bag.choice import TopicChoice
-from instant_ic.bag.recorder import BagRecorderConfig, Recorder
+from instant_ic.bag.recorder import Recorder
+from instant_ic.bag.recording import BagRecorderConfig
 from instant_ic.bag.recover import recover
 from instant_ic.bag.writer import BagWriter
 from instant_ic.bridge.host_keys import KeyStore
