@@ -1,4 +1,4 @@
-"""The node whose commands the base obeys, and a warning of every other one."""
+"""Selection of the node whose commands the base obeys, with a warning about every other publisher."""
 
 from __future__ import annotations
 
@@ -10,16 +10,16 @@ from instant_ic.util.diagnosis import Diagnosis, Level, RecentCount
 
 
 class CommandSource:
-    """Passes on the commands of one node if they may drive; reports dropped commands and other publishers.
+    """Decides which commands may drive; reports dropped commands and publishers that are not obeyed.
 
     Args:
         config: parameters.
-        on_stranger: called once with the name of each second publisher.
+        on_stranger: called once per publisher that is not obeyed, with its name.
 
     Attributes:
         driver: the obeyed node; with any source allowed, the last publisher.
         dropped: number of refused commands.
-        publishers: whether another node also publishes commands.
+        publishers: diagnosis of nodes that publish commands but are not obeyed.
         command: diagnosis of the newest command; None before the first.
     """
 
@@ -27,17 +27,17 @@ class CommandSource:
         self.config = config
         self.driver = config.command_source
         self.dropped = 0
-        # The clock of /cmd_vel's sender is the base's own: no stamp can be ahead.
+        # The sender of /cmd_vel uses the base's own clock, so no stamp can be ahead.
         limits = GateLimits(config.command_timeout_s, max_ahead_s=0.0, accept_unstamped=config.accept_unstamped)
         self._gate = CommandGate(limits)
         self.publishers = Diagnosis("publishers", Level.OK, "no second publisher of /cmd_vel")
         self.command: Diagnosis | None = None
         self._drops = RecentCount(config.recent_s)
         self._on_stranger = on_stranger
-        self._strangers: dict[str, int] = {}  # second publishers, with the time of their last message
+        self._strangers: dict[str, int] = {}  # publishers that are not obeyed -> steady time of their newest message
 
     def admit_publisher(self, publisher: str, steady_ns: int) -> bool:
-        """Return whether a node's commands are obeyed; any other publisher besides the driving node is a warning."""
+        """Return whether this publisher's commands are obeyed. Warn if it is not the only publisher."""
         if not self.config.command_source and publisher != self.driver:
             if self.driver:
                 self._warn_of(self.driver, steady_ns)
@@ -49,9 +49,9 @@ class CommandSource:
         return False
 
     def admit(self, v: float, w: float, stamp_ns: int, received_ns: int, steady_ns: int) -> bool:
-        """Return whether a command of the driving node (m/s, rad/s) is obeyed.
+        """Return whether a command of the driving node, v in m/s and w in rad/s, is obeyed.
 
-        ``stamp_ns`` is 0 without a stamp; ``received_ns`` is the arrival on the same clock.
+        ``stamp_ns`` is 0 without a stamp. ``received_ns`` is the time of arrival on the stamp's clock.
         """
         refusal = self._gate.admit(v, w, (received_ns - stamp_ns) / 1e9 if stamp_ns else None)
         if refusal is not None:
@@ -61,7 +61,7 @@ class CommandSource:
         return refusal is None
 
     def update(self, steady_ns: int) -> None:
-        """End warnings whose cause is older than ``recent_s``."""
+        """Clear warnings whose cause is older than ``recent_s``."""
         recent = f"in the last {self.config.recent_s:g} s"
         if self.dropped and not self._drops.count(steady_ns):
             self._set(Level.OK, f"none dropped {recent}")

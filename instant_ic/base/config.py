@@ -43,7 +43,7 @@ class LimitsConfig(MotionLimits):
     """Speed and acceleration limits of the base.
 
     Attributes:
-        hard_decel_m_s2: m/s²; deceleration of each track when commands stop or a command asks for a hard stop.
+        hard_decel_m_s2: m/s²; deceleration of each track when no command is fresh or a command asks for a hard stop.
     """
 
     hard_decel_m_s2: Annotated[float, Plausible(0.5, 20)] = 4.0
@@ -59,14 +59,14 @@ class RoboclawConfig:
     """Serial link to the motor controller.
 
     Attributes:
-        port: serial device, such as /dev/ttyACM0, or a pseudo-terminal.
+        port: path of the serial device, such as /dev/ttyACM0, or of a pseudo-terminal.
         baud: baud rate, 2400-460800; no effect over USB.
         address: packet serial address of the controller, 0x80-0x87 (128-135).
-        reply_timeout_s: longest wait for a reply; then the motors are stopped before the command is repeated.
-        retries: repeats of a command before the link counts as lost.
-        watchdog_s: the controller itself stops the motors after this time without a packet; steps of 0.1 s.
-        estop_pin: the controller's pin to which the robot's stop button is wired, S3, S4 or S5, which must be set to
-            E-Stop (latching); empty: the robot has no such button.
+        reply_timeout_s: longest wait for a reply. After it, the motors are stopped before the command is repeated.
+        retries: number of repeats of a command before the link counts as lost.
+        watchdog_s: time without a packet after which the controller itself stops the motors; steps of 0.1 s.
+        estop_pin: controller pin to which the robot's stop button is wired: S3, S4 or S5. The pin must be set to
+            E-Stop (latching). Empty if the robot has no stop button.
     """
 
     port: str = "/dev/ttyACM0"
@@ -94,7 +94,7 @@ class ControllerConfig(Checked):
         limits: speeds and accelerations.
         command_timeout_s: largest age of a command; older commands are dropped, and without a newer one the base
             stops hard.
-        health_period_s: time between reads of battery and the controller's watchdog.
+        health_period_s: time between two readings of the battery and of the controller's watchdog setting.
     """
 
     roboclaw: RoboclawConfig = field(default_factory=RoboclawConfig)
@@ -105,9 +105,9 @@ class ControllerConfig(Checked):
 
 
 _LEAST_PERIODS = 3
-"""Commands that may be missing before the controller's watchdog stops the motors."""
+"""Fewest command periods that the controller's watchdog must span."""
 _BITS = 10
-"""Bits of a byte on the serial line, with start and stop."""
+"""Bits per byte on the serial line, including start and stop bits."""
 
 
 @dataclass(frozen=True)
@@ -116,12 +116,12 @@ class CrawlerBaseConfig(ControllerConfig):
 
     Attributes:
         rate_hz: commands and odometry messages per second.
-        battery_full_v: main battery when full, volts.
-        battery_empty_v: voltage of the main battery when it needs charging, volts; lower voltages warn.
-        recent_s: seconds for which repeats, dropped commands and impossible readings remain a warning.
-        command_source: name of the only node whose commands are obeyed; empty: any node.
-        accept_unstamped: also obey commands without a stamp, with their arrival time as stamp.
-        unprotected: allows an empty command_source and accept_unstamped, with a permanent warning.
+        battery_full_v: voltage of the full main battery, volts.
+        battery_empty_v: voltage below which the main battery must be charged, volts; a lower voltage is a warning.
+        recent_s: time for which repeated and dropped commands and impossible readings remain a warning, seconds.
+        command_source: name of the only node whose commands are obeyed; empty obeys every node.
+        accept_unstamped: also obey commands without a stamp; their time of arrival is used instead.
+        unprotected: permit an empty command_source and accept_unstamped, with a permanent warning.
     """
 
     rate_hz: Annotated[float, Range(5, 200)] = 30.0
@@ -134,7 +134,7 @@ class CrawlerBaseConfig(ControllerConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        rule = f"at most roboclaw.watchdog_s = {self.roboclaw.watchdog_s:g} s, when the controller stops by itself"
+        rule = f"at most roboclaw.watchdog_s = {self.roboclaw.watchdog_s:g} s, after which the controller stops"
         require(self, "command_timeout_s", self.command_timeout_s <= self.roboclaw.watchdog_s, rule)
         if self.roboclaw.reply_timeout_s > self.roboclaw.watchdog_s:
             raise ValueError(f"roboclaw.reply_timeout_s must be {rule} (got {self.roboclaw.reply_timeout_s})")

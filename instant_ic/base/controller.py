@@ -1,4 +1,4 @@
-"""Control loop of the base at a fixed rate: takes the newest command, returns odometry and health, stops on faults."""
+"""Control loop of the base: sends the newest command at a fixed rate, returns odometry and health, stops on faults."""
 
 import threading
 from collections.abc import Callable
@@ -17,15 +17,15 @@ from instant_ic.util.reconnect import Backoff
 from instant_ic.util.step_gap import StepGap
 
 _COUNTED_SINCE_M = 0.2
-"""Largest count, in metres of track, that a restarted controller can reach before the next reading."""
+"""Largest track distance, in metres, that a restarted controller can have counted by the next reading."""
 _RUNAWAY = 1.2
-"""Error of a track's speed, as a share of the fastest command, at which the controller itself stops the motor."""
+"""Speed error of a track, as a share of its fastest commanded speed, at which the controller itself stops the motor."""
 _RECONNECT_MIN_S, RECONNECT_MAX_S = 0.2, 2.0
-"""Waits before the port is reopened; see :class:`Backoff`."""
+"""Shortest and longest wait before the port is reopened; see :class:`Backoff`."""
 _SURE_WITHIN_S = 0.025
-"""A reading that took longer may be as much older than its stamp: the process had to wait for the processor."""
+"""Longest exchange whose reading has a certain time. In a longer one, the process may have waited for a CPU."""
 _UNSURE_AFTER_S = 0.2
-"""After this time without a surer reading, an unsure one is taken."""
+"""Time without a certain reading after which an uncertain one is used."""
 
 
 @dataclass(frozen=True)
@@ -42,12 +42,12 @@ class BaseState:
 
     Attributes:
         connected: whether the controller answers.
-        link: text of the link event in this step; empty without one.
-        fault: which track does not follow its command, so that the base has stopped; empty otherwise.
-        restarted: the controller had lost its settings, so that the base has stopped.
-        odometry: new estimate, if any.
-        status: faults and warnings of the controller, if it was read; with a fault the base has stopped.
-        health: battery, if it was read in this step.
+        link: text of a link event in this step; empty if there was none.
+        fault: text about a track that does not follow, because of which the base has stopped; empty if both follow.
+        restarted: true if the controller had lost its settings; the base has then stopped.
+        odometry: new estimate; None if there is none.
+        status: faults and warnings of the controller; None if they were not read. On a fault the base has stopped.
+        health: battery; None if it was not read in this step.
         command_fresh: whether a command within the time-out was available.
         v: speed sent to the motors, m/s.
         w: turn rate sent to the motors, rad/s.
@@ -75,7 +75,7 @@ class _Command:
 
 
 class BaseController:
-    """Steps the base.
+    """Runs the control loop, one cycle per `step`.
 
     `command` and `emergency_stop` may be called from any thread, everything else from one thread only.
     """
@@ -92,10 +92,10 @@ class BaseController:
 
         Args:
             config: parameters.
-            now_ns: clock of the stamps, nanoseconds since the epoch; the system may set this clock at any time.
-            steady_ns: monotonic clock of every age, period and time-out.
-            open_port: opens the serial port.
-            suspended_ns: time for which the machine was suspended.
+            now_ns: clock for stamps, nanoseconds since the epoch; the system may set this clock at any time.
+            steady_ns: monotonic clock for ages, periods and time-outs.
+            open_port: function that opens the serial port.
+            suspended_ns: clock that counts the time for which the machine was suspended.
         """
         self.config = config
         self.roboclaw = Roboclaw(config.roboclaw, open_port)
@@ -105,7 +105,7 @@ class BaseController:
         self._steady_ns = steady_ns
         self._suspended_ns = suspended_ns
         self._gap = StepGap()
-        self._awake_ns = 0  # older commands are from before the last gap
+        self._awake_ns = 0  # end of the last gap between steps; commands from before it do not count
         self._lock = threading.Lock()
         self._command: _Command | None = None
         self._stopped = False
@@ -114,10 +114,12 @@ class BaseController:
         self._fastest_m_s = limits.max_linear_m_s + 0.5 * config.geometry.effective_width * limits.max_angular_rad_s
         pulse_m = 1.0 / config.geometry.pulses_per_metre
         self._watch = TrackWatch(self._fastest_m_s, pulse_m, simulated=not current().real)
-        self._watched: tuple[NDArray[np.int64], int] | None = None  # the last counts that it judged, and their time
-        self._sent: tuple[NDArray[np.float64], int] | None = None  # speeds of the tracks, and until when it has them
+        self._watched: tuple[NDArray[np.int64], int] | None = None  # last counts judged by the watch, and their time
+        self._sent: tuple[NDArray[np.float64], int] | None = (
+            None  # track speeds, and time up to which the watch knows them
+        )
         self._last_step_ns: int | None = None
-        self._placed_ns: int | None = None  # the last reading that the odometry took
+        self._placed_ns: int | None = None  # time of the last reading used for odometry
         self._next_health_ns = 0
         self._next_connect_ns = 0
         self._backoff = Backoff(_RECONNECT_MIN_S, RECONNECT_MAX_S)
@@ -135,9 +137,9 @@ class BaseController:
             self._command = _Command(v, w, hard, given_ns)
 
     def emergency_stop(self, stopped: bool) -> None:
-        """Take the power off the motors, which brakes them, while ``stopped``.
+        """Take the power off the motors while ``stopped``, which brakes them.
 
-        The current command is discarded: after the release the base stands until a new command arrives.
+        The current command is discarded, so after the release the base stands until a new command arrives.
         """
         with self._lock:
             if stopped or self._stopped:
@@ -145,9 +147,9 @@ class BaseController:
             self._stopped = stopped
 
     def step(self) -> BaseState:
-        """Send the motor speeds, read encoders, power, currents and status and, every ``health_period_s``, the health.
+        """Send motor speeds, then read encoders, power, currents, status and, every ``health_period_s``, the health.
 
-        The base stops as in an emergency when a track does not follow or the controller reports a fault.
+        The base makes an emergency stop when a track does not follow or the controller reports a fault.
         """
         now_ns = self._steady_ns()
         gap_s = self._gap.step(now_ns, self._suspended_ns())
@@ -158,7 +160,7 @@ class BaseController:
         dt_s = 0.0 if self._last_step_ns is None else max(0.0, (now_ns - self._last_step_ns) * 1e-9)
         self._last_step_ns = now_ns
         if gap_s or dt_s > self.config.roboclaw.watchdog_s:
-            # The controller's watchdog has stopped the motors in the meantime.
+            # The controller's watchdog has stopped the motors during the gap.
             self._forget_motion()
             dt_s = 0.0
         command = self._fresh_command()
@@ -205,7 +207,7 @@ class BaseController:
         )
 
     def _read_health(self, now_ns: int) -> Health | None:
-        """Check the watchdog and read the battery every ``health_period_s``; None between."""
+        """Check the watchdog and read the battery if ``health_period_s`` has passed, else return None."""
         if now_ns < self._next_health_ns:
             return None
         self.roboclaw.check_watchdog()
@@ -214,7 +216,7 @@ class BaseController:
         return health
 
     def _sure(self, asked_ns: int, read_ns: int) -> bool:
-        """Return whether the time of a reading is certain enough; the next one makes up for a dropped one."""
+        """Return whether the time of a reading is certain enough. The next reading contains a dropped one's motion."""
         before_ns = self._placed_ns
         late = read_ns - asked_ns > _SURE_WITHIN_S * 1e9
         if late and before_ns is not None and read_ns - before_ns < _UNSURE_AFTER_S * 1e9:
@@ -243,12 +245,12 @@ class BaseController:
         stands = not (self.limiter.v or self.limiter.w)
         if command is None or command.hard:
             v, w = self.limiter.brake(limits.hard_decel_m_s2, limits.hard_decel_m_s2 / half_width, dt_s)
-            # The controller ramps down by itself, so the ramp ends even if no packet follows. The limiter tracks it.
+            # The controller ramps down to zero even if no further packet arrives; the limiter follows the same ramp.
             speeds, ramp = np.zeros(2), limits.hard_decel_m_s2
         else:
             v, w = self.limiter.step(command.v, command.w, dt_s)
             speeds = kinematics.motors_from_tracks(kinematics.tracks_from_twist(v, w))
-            # The limiter shapes the twist; the controller's ramp allows both parts at once on one track.
+            # The limiter already limits both accelerations; one track may need the sum of the two.
             ramp = limits.max_linear_accel_m_s2 + half_width * limits.max_angular_accel_rad_s2
         if stands and not (v or w):
             # A speed loop at zero could still drive a track whose encoder is dead or reversed.
@@ -259,13 +261,13 @@ class BaseController:
         return v, w
 
     def _forget_motion(self) -> None:
-        """Start again from standing: something else has stopped the motors."""
+        """Assume that the robot stands, because the motors were stopped by other means than the limiter."""
         self.limiter.reset()
         self._watch.reset()
         self._watched = self._sent = None
 
     def _note_speeds(self, v: float, w: float, sent_ns: int, now_ns: int) -> None:
-        """Report to the watch the speeds commanded until ``now_ns``; ``v`` and ``w`` since ``sent_ns`` only."""
+        """Report the commanded speeds to the watch: the previous ones until ``sent_ns``, then ``v`` and ``w``."""
         speeds = self.odometry.kinematics.tracks_from_twist(v, w)
         if self._sent is not None:
             before, since_ns = self._sent
@@ -281,7 +283,7 @@ class BaseController:
         asked_ns: int,
         read_ns: int,
     ) -> str:
-        """Return why a track does not follow what drives it; empty if both do."""
+        """Return why a track does not follow its power, as text; empty if both follow."""
         last, self._watched = self._watched, (encoders, read_ns)
         if last is None or self._sent is None:
             return ""
@@ -290,11 +292,11 @@ class BaseController:
         per_metre = self.config.geometry.pulses_per_metre
         powers = kinematics.tracks_from_motors(power * per_metre)
         currents = kinematics.tracks_from_motors(current_a * per_metre)
-        # The counts are from between request and reply: at least this time has passed since the last.
+        # Counts are taken between request and reply, so at least this time has passed since the previous ones.
         return self._watch.judge(moved, powers, currents, max(0, asked_ns - last[1]) * 1e-9)
 
     def _check_counts(self, encoders: NDArray[np.int64]) -> None:
-        """Check the watchdog when both counts jump to zero: the controller may have restarted."""
+        """Check the watchdog if both counts jumped to zero, because the controller may have restarted."""
         last, self._encoders = self._encoders, encoders
         if last is not None and last.any() and not encoders.any():
             self.roboclaw.check_watchdog()
@@ -308,8 +310,8 @@ class BaseController:
         """Stop the motors at once and release the port.
 
         Returns:
-            Why the stop command failed (the controller's watchdog then stops the motors). Empty if it succeeded or
-            there was no connection.
+            Why the stop command failed; the controller's watchdog then stops the motors. Empty if the command succeeded
+            or there was no connection.
         """
         if not self.roboclaw.connected:
             return ""
@@ -323,7 +325,7 @@ class BaseController:
         return ""
 
     def _connect(self, now_ns: int) -> BaseState:
-        """Connect when it is time; the base stops as in an emergency when the controller has restarted meanwhile."""
+        """Connect if the wait is over. Make an emergency stop if the controller has restarted in the meantime."""
         if now_ns < self._next_connect_ns:
             return BaseState(connected=False)
         failure, version, limited = "", "", False
@@ -354,7 +356,7 @@ class BaseController:
 
 
 class ControllerThread(threading.Thread):
-    """Steps a controller at a fixed rate on its own thread, so that other work does not delay motor commands."""
+    """Steps a controller at a fixed rate on a thread of its own, so that other work does not delay motor commands."""
 
     def __init__(
         self,
@@ -366,7 +368,7 @@ class ControllerThread(threading.Thread):
         """Create the thread without starting it.
 
         Args:
-            controller: used by this thread only, except `BaseController.command` and `emergency_stop`.
+            controller: controller to step. Other threads may call only its `command` and `emergency_stop`.
             rate_hz: steps per second.
             on_state: called on this thread after each step.
             on_end: called on this thread when it ends, with the exception that ended it and the result of
@@ -381,12 +383,12 @@ class ControllerThread(threading.Thread):
         self._wake = threading.Event()
 
     def run(self) -> None:
-        """Step until `end`; stop the motors in every case."""
+        """Step until `end`, then stop the motors, also after an exception."""
         fault: BaseException | None = None
         pace = current()
         due_s = pace.steady_s()
         try:
-            # Fixed due times: the duration of a step does not slow the rate, and missed steps are skipped.
+            # The due times are fixed, so the duration of a step does not lower the rate. Missed steps are skipped.
             while not self._end.is_set():
                 self._wake.wait(pace.wait_s(max(0.0, due_s - pace.steady_s())))
                 if self._end.is_set():
@@ -405,7 +407,7 @@ class ControllerThread(threading.Thread):
         self._wake.set()
 
     def end(self, timeout_s: float = 2.0) -> bool:
-        """Stop the motors and the thread; return False if the thread does not end in time."""
+        """Stop the motors and the thread; return whether the thread ended in time."""
         self._end.set()
         self._wake.set()
         if self.is_alive():
@@ -414,7 +416,7 @@ class ControllerThread(threading.Thread):
 
 
 class SteppedController(ControllerThread):
-    """Steps the controller in the caller's thread, at each :meth:`hurry`: for lockstep."""
+    """Controller for lockstep: each :meth:`hurry` runs one step on the caller's thread."""
 
     def start(self) -> None:
         """Start no thread."""

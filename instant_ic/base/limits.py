@@ -37,10 +37,10 @@ class TwistLimiter:
         self.w = step_towards(self.w, w, self.config.max_angular_accel_rad_s2 * dt_s)
         return self.v, self.w
 
-    def brake(self, deceleration: float, w_deceleration: float, dt_s: float) -> tuple[float, float]:
-        """Return the next twist towards zero after ``dt_s`` seconds, at the given rates (m/s^2, rad/s^2)."""
-        self.v = step_towards(self.v, 0.0, deceleration * dt_s)
-        self.w = step_towards(self.w, 0.0, w_deceleration * dt_s)
+    def brake(self, decel_m_s2: float, decel_rad_s2: float, dt_s: float) -> tuple[float, float]:
+        """Return the next twist towards zero after ``dt_s`` seconds."""
+        self.v = step_towards(self.v, 0.0, decel_m_s2 * dt_s)
+        self.w = step_towards(self.w, 0.0, decel_rad_s2 * dt_s)
         return self.v, self.w
 
     def reset(self) -> None:

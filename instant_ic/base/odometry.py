@@ -12,8 +12,8 @@ from instant_ic.geometry.poses import planar_covariance
 
 _MAX_TRACK_SPEED = 3.0  # m/s; a reading that implies more is rejected
 _JITTER_M = 0.05
-"""A smaller step is no jump, however short its time seems: on a busy machine a reading may come late and the next soon.
-The speed between them means nothing; the next reading has the motion.
+"""Largest step, in metres, that is never rejected as a jump. On a busy machine, a late reading may be followed soon by
+the next one, so the speed between the two means nothing.
 """
 UNMEASURED_VARIANCE = 1e6
 """Variance of z, roll and pitch, which encoders do not measure."""
@@ -50,8 +50,8 @@ class WheelOdometry:
     """Integrates encoder counts into a pose with covariance.
 
     Attributes:
-        rejected: number of readings implausibly far from the previous one (the controller lost its counts). The pose
-            stays, and integration continues from the new reading.
+        rejected: number of readings that were implausibly far from the previous one, because the controller lost its
+            counts. The pose is kept, and integration continues from the new reading.
     """
 
     def __init__(self, geometry: SkidSteerConfig) -> None:
@@ -71,10 +71,10 @@ class WheelOdometry:
 
         Args:
             encoders: counts of M1 and M2 modulo 2^32, (2,).
-            stamp_ns: when they were read.
+            stamp_ns: time of the reading.
 
         Returns:
-            The new estimate; None for the first reading, one that is not newer or too soon, and a rejected one.
+            The new estimate; None if the reading is the first, is not newer, comes too soon or is rejected.
         """
         counts = np.asarray(encoders, np.int64)
         last, self._last = self._last, (counts, stamp_ns)

@@ -1,4 +1,4 @@
-"""A real base runs on real time only."""
+"""Check that a real base runs in real time."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ from instant_ic.util.pace import Pace, PaceError
 
 
 def refuse_pace(pace: Pace, port: str, run_dir: Path | None) -> None:
-    """Refuse to run a real base on scaled time: it would stop late. Only the simulator's base may.
+    """Refuse to run a real base on scaled time, because it would stop late.
 
     Raises:
-        PaceError: the stack's time is not the machine's, and the port is not the simulator's in the run directory.
+        PaceError: the stack's time is scaled, and the port is not the simulator's port in the run directory.
     """
     if pace.real or (run_dir is not None and Path(port).is_relative_to(run_dir)):
         return

@@ -11,7 +11,7 @@ BAUD_RATES = (2400, 9600, 19200, 38400, 57600, 115200, 230400, 460800)
 ADDRESSES = range(0x80, 0x88)
 ACKNOWLEDGE = b"\xff"
 INTER_BYTE_GAP_S = 0.010
-"""Longest gap between bytes; the controller drops a packet with a longer one."""
+"""Longest gap between two bytes of a packet. The controller drops a packet with a longer gap."""
 
 
 class Command(IntEnum):
@@ -42,11 +42,11 @@ WRITE_DATA_BYTES: dict[int, int] = {
 }
 """Write commands (acknowledged with 0xFF) and the number of data bytes in each."""
 CYCLE_BYTES = 64
-"""Bytes on the line in a control cycle with health: commands 40, 78, 48, 49, 90, 15 and 24 with their replies."""
+"""Bytes of a control cycle that reads the health: commands 40, 78, 48, 49, 90, 15 and 24 with their replies."""
 
 PINS = ("S3", "S4", "S5")
 MOTORS_OFF = struct.pack(">hIhI", 0, 655359, 0, 655359)
-"""Data of command 54: no power on both motors, with the steepest ramp (full power to none in 50 ms)."""
+"""Data of command 54: no power on either motor, with the steepest ramp (full power to none in 50 ms)."""
 PWM_MAX = 32767
 
 STATUS_FAULTS: dict[int, str] = {
@@ -131,13 +131,13 @@ def decode_reply(address: int, command: int, reply: bytes) -> bytes:
 
 
 ESTOP_BITS = {4: 0x0001, 2: 0x0004}
-"""Bit of the emergency stop input, by the length of the status."""
+"""Emergency stop bit of a status, by the status's length in bytes."""
 
 
 def describe_status(status: int, status_bytes: int) -> tuple[list[str], list[str]]:
-    """Return the texts of the faults and of the warnings in a status of 2 or 4 bytes (command 90).
+    """Return the fault texts and the warning texts of a status of 2 or 4 bytes (command 90).
 
-    With a fault the motors do not run, or not reliably.
+    During a fault, the motors do not run or do not run reliably.
     """
     if status_bytes == 2:
         named = [(bit, text) for bit, text in STATUS_FAULTS_2_BYTES.items() if status & bit]
@@ -151,8 +151,8 @@ def describe_status(status: int, status_bytes: int) -> tuple[list[str], list[str
 
 
 def latches(mode: int, pin: str, status_bytes: int) -> bool:
-    """Return whether a mode of command 75 makes a pin a latching emergency stop.
+    """Return whether a pin's mode (command 75) is a latching emergency stop.
 
-    In the packet serial modes, S3 is one by default. Firmware with a short status numbers the modes in another way.
+    In packet serial mode, S3 is a latching stop by default. Firmware with a short status numbers the modes differently.
     """
     return mode == (0x81 if status_bytes == 4 else 0x01) or (mode == 0 and pin == "S3")

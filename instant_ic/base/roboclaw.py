@@ -33,7 +33,7 @@ class LinkError(ConnectionError):
 
 
 class ControllerRestarted(LinkError):
-    """The controller lost its settings, for example in a brown-out: stop it and set it up again at once."""
+    """The controller lost its settings, for example in a brown-out. Stop the base and connect again at once."""
 
 
 class SerialPort(Protocol):
@@ -46,7 +46,7 @@ class SerialPort(Protocol):
         """Receive up to ``size`` bytes, fewer if the port's time-out expires."""
 
     def reset_input_buffer(self) -> None:
-        """Drop received bytes that were not read."""
+        """Drop received bytes that have not been read."""
 
     def close(self) -> None:
         """Release the port."""
@@ -58,7 +58,7 @@ class ControllerStatus:
 
     Attributes:
         value: status bits.
-        size: length in bytes, 2 or 4; the two lengths define different bits.
+        size: length in bytes, 2 or 4; each length has its own meaning of the bits.
     """
 
     value: int
@@ -78,10 +78,10 @@ class LinkCounters:
     """Link statistics since the driver was created.
 
     Attributes:
-        retries: repeated commands.
-        timeouts: missing or incomplete replies.
-        crc_errors: damaged replies.
-        stops: stops of the motors because of a missing reply.
+        retries: number of repeated commands.
+        timeouts: number of missing or incomplete replies.
+        crc_errors: number of damaged replies.
+        stops: number of times the motors were stopped because a reply was missing.
     """
 
     retries: int = 0
@@ -115,11 +115,11 @@ def open_serial(config: RoboclawConfig) -> SerialPort:
 
 
 _DRAIN_READS = 20
-"""Reads after which a line that is never quiet is used all the same."""
+"""Number of reads after which the driver stops waiting for a quiet line."""
 
 
 def _tenths(timeout_s: float) -> int:
-    """Return the value of command 14 for a watchdog time, rounded down, at least 1: 0 turns the watchdog off."""
+    """Return the value of command 14 for a watchdog time, rounded down but at least 1, as 0 turns the watchdog off."""
     return max(1, int(timeout_s * 10 + 1e-6))
 
 
@@ -133,13 +133,13 @@ def _acknowledged(port: SerialPort, command: int) -> bytes:
 
 
 class Roboclaw:
-    """One controller with one method per command; each command is repeated up to ``retries`` times.
+    """Driver of one controller with one method per command, each repeated up to ``retries`` times.
 
-    Every valid packet feeds the controller's watchdog, so a request sent while replies are missing could keep the
-    motors running. After a missing reply, and on each `connect`, the driver sends only stops until the controller
-    has acknowledged one. Acknowledgements have no number, so the driver first waits until the line is quiet: a late one
-    must not acknowledge the next command. A stop takes the power off the motors. A set point of zero would leave it to
-    the speed loop, which drives on when an encoder is dead or reversed.
+    Every valid packet resets the controller's watchdog, so a request sent while replies are missing could keep the
+    motors running. After a missing reply, and on each `connect`, the driver sends only stops until the controller has
+    acknowledged one. Acknowledgements have no number, so the driver first waits until the line is quiet. Otherwise a
+    late acknowledgement could confirm the next command. A stop takes the power off the motors. A set point of zero
+    would not stop a track with a dead or reversed encoder, because the speed loop would go on driving it.
 
     Example:
         >>> with closing(Roboclaw(RoboclawConfig(port="/dev/ttyACM0"))) as roboclaw:   # doctest: +SKIP
@@ -156,10 +156,10 @@ class Roboclaw:
         self.config = config
         self.counters = LinkCounters()
         self.restarted = False
-        """True if the controller had lost the watchdog setting of an earlier connection at the last `connect`."""
+        """True if, at the last `connect`, the controller had lost the watchdog setting of an earlier connection."""
         self._was_set = False
         self._stop_frame = write_frame(config.address, Command.DUTY_ACCELERATION_BOTH, MOTORS_OFF)
-        self._has_limits = True  # until the firmware does not answer
+        self._has_limits = True  # false once the firmware has not answered a limit command
         self._open_port = open_port
         self._sleep = sleep
         self._port: SerialPort | None = None
@@ -211,7 +211,7 @@ class Roboclaw:
         self._write(Command.SPEED_ACCELERATION_BOTH, struct.pack(">Iii", round(acceleration_pps2), m1, m2))
 
     def stop(self) -> None:
-        """Take the power off both motors, which brakes them whatever the encoders count (command 54)."""
+        """Take the power off both motors, which brakes them independently of the encoders (command 54)."""
         self._transact(Command.DUTY_ACCELERATION_BOTH, _acknowledged, self._stop_frame)
 
     def set_watchdog(self, timeout_s: float) -> None:
@@ -240,14 +240,14 @@ class Roboclaw:
         """Check that the pin of the robot's stop button is a latching emergency stop (command 75).
 
         Raises:
-            LinkError: it is not, or its mode cannot be read.
+            LinkError: the pin is not a latching stop, or its mode cannot be read.
         """
         pin, port = self.config.estop_pin, self.config.port
         if not pin:
             return
         advice = (
             f"The robot does not drive. Set {pin} to E-Stop (latching) with the manufacturer's tool and save it in the "
-            "controller, or set roboclaw.estop_pin to the button's pin, to '' without a button."
+            "controller, or set roboclaw.estop_pin to the button's pin, or to '' if there is no button."
         )
         size = self.status().size
         try:
@@ -259,13 +259,13 @@ class Roboclaw:
             raise LinkError(f"{port}: mode 0x{mode:02x} of the stop button's pin {pin} is no latching stop. {advice}")
 
     def limit_speed_error(self, limit_pps: float) -> bool:
-        """Make the controller itself stop a motor whose measured speed is farther from its set point (command 109).
+        """Set the speed error at which the controller itself stops a motor (command 109), and read it back.
 
         Args:
-            limit_pps: largest difference, pulses/s; read back afterwards.
+            limit_pps: largest difference between measured speed and set point, pulses/s.
 
         Returns:
-            Whether the firmware has such a limit and took it.
+            True if the firmware has such a limit and accepted the value.
         """
         if not self._has_limits:
             return False
@@ -317,13 +317,13 @@ class Roboclaw:
         return round(found_s * 10) == _tenths(self.config.watchdog_s)
 
     def _drain(self, port: SerialPort) -> None:
-        """Drop what still arrives, until nothing has for ``reply_timeout_s``."""
+        """Drop received bytes until none has arrived for ``reply_timeout_s``."""
         for _ in range(_DRAIN_READS):
             if not port.read(64):
                 return
 
     def _stop_blind(self) -> None:
-        """Write a stop twice without awaiting a reply; the first frame may be lost behind a damaged one."""
+        """Write a stop twice without waiting for a reply. The first may be lost after a damaged frame."""
         if self._port is None:
             return
         try:
@@ -331,8 +331,8 @@ class Roboclaw:
             self._sleep(1.5 * INTER_BYTE_GAP_S)
             self._port.write(self._stop_frame)
         except (OSError, termios.error):
-            # Unplugged: the controller is out of reach, and its watchdog stops the motors. The caller that closes the
-            # port has already raised a LinkError.
+            # The cable is unplugged; the controller's watchdog stops the motors. The caller that closes the port has
+            # already raised a LinkError.
             return
 
     def _write(self, command: int, data: bytes) -> None:
@@ -342,7 +342,7 @@ class Roboclaw:
         return self._transact(command, self._reply(size))
 
     def _reply(self, *sizes: int) -> Callable[[SerialPort, int], bytes]:
-        """Return the reader of a reply with one of ``sizes`` bytes of data, which depend on the firmware; ascending."""
+        """Return a reader of replies whose data length depends on the firmware; ``sizes`` are in ascending order."""
 
         def read(port: SerialPort, command: int) -> bytes:
             received = port.read(sizes[-1] + 2)
@@ -353,7 +353,7 @@ class Roboclaw:
         return read
 
     def _version_reply(self, port: SerialPort, command: int) -> bytes:
-        """Read text up to its null byte, then the CRC; the length is not known in advance."""
+        """Read text up to its null byte, then the CRC. The length is not known in advance."""
         received = bytearray()
         while not received.endswith(b"\0"):
             byte = port.read(1)
@@ -364,9 +364,9 @@ class Roboclaw:
         return decode_reply(self.config.address, command, bytes(received)).rstrip(b"\0")
 
     def _transact(self, command: int, receive: Callable[[SerialPort, int], bytes], frame: bytes | None = None) -> bytes:
-        """Send a frame and receive its reply, with repeats.
+        """Send a frame and receive its reply; repeat both if the reply is missing or damaged.
 
-        After a missing reply the motors are stopped first. A command that moves them is not repeated: it ends with the
+        Before a repeat, the motors are stopped. A command that moves them is not repeated, but ends with the
         acknowledged stop.
 
         Raises:
@@ -375,7 +375,7 @@ class Roboclaw:
         port = self._port
         if port is None:
             raise LinkError(f"{self.config.port}: not connected; call connect() first")
-        # One write call per frame: the controller drops a frame with gaps between its bytes.
+        # Write each frame in one call, because the controller drops a frame with gaps between its bytes.
         sent = frame or read_request(self.config.address, command)
         failure, silent = "", False
         for attempt in range(self.config.retries + 1):
@@ -404,7 +404,7 @@ class Roboclaw:
             except ProtocolError as error:
                 self.counters.crc_errors += 1
                 failure = failure or str(error)
-            # Unplugged, or the pseudo-terminal is gone; pyserial's exception is an OSError.
+            # The cable is unplugged or the pseudo-terminal is gone; pyserial's exception is an OSError.
             except (OSError, termios.error) as error:
                 self.close()
                 raise LinkError(f"{self.config.port}: connection lost ({error})") from error

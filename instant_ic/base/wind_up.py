@@ -1,14 +1,14 @@
-"""Notices a track without counts whose power winds up slowly: a dead or reversed encoder at a creeping command.
+"""Detection of a track whose power rises slowly without counts: a dead or reversed encoder at a slow command.
 
-A track that stands draws more current with more power: the stall current grows in proportion. One that turns draws the
-current of its load, whatever the power. So, for each track:
+The current of a standing track grows in proportion to its power. The current of a turning track depends on its load
+only. For each track:
 
-1. It is silent when it lacks more counts than stick and slip at one command explain.
-2. Power and current, smoothed, are compared with those of the last count. While both rise together the track stands,
-   and the comparison begins again from there.
-3. The silent track turns when its power has risen more than its current explains.
+1. The track is silent when it lacks more counts than stick-slip at one command explains.
+2. Compare the smoothed power and current with those at the last count. While both rise together, the track stands, and
+   the comparison starts again from the present values.
+3. A silent track turns when its power has risen by more than its current explains.
 
-Neither the load nor the stall current has to be known, only that the current is shown.
+The method needs a current reading, but neither the load nor the stall current.
 """
 
 import math
@@ -17,33 +17,34 @@ import numpy as np
 from numpy.typing import NDArray
 
 LEAST_SHARE = 0.25
-"""Share of its speed that a healthy track counts at least."""
+"""Smallest share of its speed that a healthy track counts."""
 LEAST_A, LEAST_POWER = 0.2, 0.03
-"""Smaller currents and powers show nothing."""
+"""Smallest current, in amperes, and smallest power that are used."""
 _SILENT_M, _SILENT_PULSES, _SILENT_S = 0.002, 2.0, 0.3
-"""Commanded motion, pulses, and time at the command, without counts after which a track is silent."""
+"""Commanded motion in metres, in pulses, and as time at the command in seconds after which a track without counts is
+silent; the largest applies."""
 _STEADY = 0.25
-"""Braking, as a share of the command, up to which it is steady: a track that brakes draws current too."""
+"""Largest braking, as a share of the command, at which a track is judged, because braking draws current too."""
 _SMOOTH_S = 0.1
 """Time constant of the smoothed power and current."""
 _NOISE_S, _MOST_NOISE_A = 1.0, 0.5
-"""Time constant, and largest change between two readings, of the noise of a current."""
+"""Time constant in seconds of the current's noise, and largest change between two readings that counts as noise."""
 _MORE_POWER, _MARGIN = 0.01, 2.0
-"""Unexplained power of a track that turns, and factor on what the current and its noise explain."""
+"""Smallest unexplained power of a turning track, and factor on the power that current and noise explain."""
 
 
 class WindUpWatch:
-    """Compares the rise of power and current on both tracks while they do not count.
+    """Compares the rise of power and current of both tracks while they do not count.
 
     Args:
-        pulse_m: motion of a track for one pulse of its encoder, metres.
+        pulse_m: track distance per encoder pulse, metres.
     """
 
     def __init__(self, pulse_m: float) -> None:
         self._silent_m = max(_SILENT_M, _SILENT_PULSES * pulse_m)
         self._lacks_m = np.zeros(2)
-        self._smooth = np.zeros((2, 2))  # power in the direction of the command, and current in amperes
-        self._start = np.zeros((2, 2))  # the same when the track last counted, or drew the current of one that stands
+        self._smooth = np.zeros((2, 2))  # row 0: power in the command's direction; row 1: current, A
+        self._start = np.zeros((2, 2))  # _smooth when the track last counted or was last seen standing
         self._current_a = np.zeros(2)  # at the last reading
         self._noise_a = np.zeros(2)
 
@@ -56,14 +57,14 @@ class WindUpWatch:
         current_a: NDArray[np.float64],
         dt_s: float,
     ) -> NDArray[np.bool_]:
-        """Return for each track whether it turns without counts, (2,).
+        """Return for each track, (2,), whether it turns without counts.
 
         Args:
             command: commanded speeds, m/s, (2,).
-            braking: how much the command has recently slowed or reversed each track, m/s, (2,).
-            moved: motion since the last reading by the counts, metres, (2,).
+            braking: recent change of the command that slows or reverses the track, m/s, (2,).
+            moved: counted motion since the last reading, metres, (2,).
             power: power now, -1 to 1, (2,).
-            current_a: sizes of the currents now, amperes, (2,).
+            current_a: absolute currents now, amperes, (2,).
             dt_s: time since the last reading, seconds.
         """
         speed, way = np.abs(command), np.sign(command)
@@ -77,7 +78,7 @@ class WindUpWatch:
         self._smooth += (np.array([power * way, current_a]) - self._smooth) * -math.expm1(-dt_s / _SMOOTH_S)
         self._smooth, self._start = np.where(power * way > 0.0, (self._smooth, self._start), 0.0)
         (least, least_a), (most, most_a) = self._start, self._smooth
-        # A track that stands draws at least as much current for its power as one that turns.
+        # For the same power, a standing track draws at least as much current as a turning one.
         power_per_a = np.maximum(least, LEAST_POWER) / np.maximum(least_a, LEAST_A)
         explained = (most_a - least_a) * power_per_a
         unsure = _MORE_POWER + _MARGIN * self._noise_a * power_per_a

@@ -102,7 +102,7 @@ def test_a_fault_of_the_controller_stops_and_latches_with_its_name(bit: int, sta
     emulator.status = bit
     bench.run(0.06, v=0.3)
     level, text = bench.diagnosis("controller")
-    assert level == ERROR and text.startswith(f"{name}. The robot has stopped: remove the cause")
+    assert level == ERROR and text.startswith(f"{name}. The robot has stopped. Remove the cause")
     assert bench.bus.last("/robot/estop").data is True, "the arbiter stops too"
     bench.estop(False)
     assert bench.node.latch.stopped, "no release while the fault lasts"
@@ -110,7 +110,7 @@ def test_a_fault_of_the_controller_stops_and_latches_with_its_name(bit: int, sta
     bench.run(0.4, v=0.3)
     assert bench.line.speed == 0.0 and not emulator.closed_loop
     level, text = bench.diagnosis("controller")
-    assert level == ERROR and text.startswith(f"{name}. The robot has stopped: it is over; release")
+    assert level == ERROR and text.startswith(f"{name}. The robot has stopped. The fault is gone; release")
     bench.estop(False)
     bench.run(0.4, v=0.3)
     assert bench.line.speed > 0.1
