@@ -19,8 +19,7 @@ class FaultList:
     def __init__(self, clock: Clock) -> None:
         self._clock = clock
         self._diagnoses: dict[str, tuple[int, str, float]] = {}
-        self._heartbeats: dict[str, tuple[float, bool]] = {}
-        self._cpu_percent: dict[str, float] = {}
+        self._heartbeats: dict[str, tuple[float, NodeStatus]] = {}  # of nodes that have not announced their shutdown
 
     @property
     def _now_s(self) -> float:
@@ -29,9 +28,9 @@ class FaultList:
     def nodes(self) -> list[dict[str, Any]]:
         """Return the running nodes: ``name``, and ``cpu_percent`` of one core."""
         return [
-            {"name": name, "cpu_percent": round(self._cpu_percent[name], 1)}
-            for name, (seen_s, stopping) in sorted(self._heartbeats.items())
-            if not stopping and self._now_s - seen_s <= TIMEOUT_S
+            {"name": name, "cpu_percent": round(float(self._heartbeats[name][1].cpu_percent), 1)}
+            for name in sorted(self._heartbeats)
+            if self._now_s - self._heartbeats[name][0] <= TIMEOUT_S
         ]
 
     def take_diagnoses(self, message: DiagnosticArray) -> None:
@@ -46,10 +45,10 @@ class FaultList:
 
     def take_heartbeat(self, message: NodeStatus) -> None:
         """Note a node's heartbeat. A node that announced its shutdown does not count as missing."""
-        if message.node not in self._heartbeats and len(self._heartbeats) >= MOST_NAMES:
-            return
-        self._heartbeats[message.node] = (self._now_s, int(message.state) == NodeStatus.STOPPING)
-        self._cpu_percent[message.node] = float(message.cpu_percent)
+        if int(message.state) == NodeStatus.STOPPING:
+            self._heartbeats.pop(message.node, None)
+        elif message.node in self._heartbeats or len(self._heartbeats) < MOST_NAMES:
+            self._heartbeats[message.node] = self._now_s, message
 
     def worst(self) -> list[dict[str, str]]:
         """Return the worst present fault of each node, worst first: ``level`` (warn, error), ``name``, ``text``."""
@@ -61,8 +60,8 @@ class FaultList:
         ]
         found += [
             (ERROR, name, "does not answer")
-            for name, (seen_s, stopping) in self._heartbeats.items()
-            if not stopping and now_s - seen_s > TIMEOUT_S
+            for name, (seen_s, _) in self._heartbeats.items()
+            if now_s - seen_s > TIMEOUT_S
         ]
         worst: dict[str, tuple[int, str]] = {}
         for level, name, text in sorted(found, key=lambda fault: -fault[0]):

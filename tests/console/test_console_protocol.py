@@ -1,7 +1,7 @@
 """Frames and messages of the page's WebSocket."""
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from instant_ic.console.protocol import (
@@ -19,6 +19,7 @@ from instant_ic.console.protocol import (
 values = st.one_of(st.none(), st.booleans(), st.integers(-(2**53), 2**53), st.text(max_size=8))
 
 
+@settings(max_examples=30)
 @given(
     st.sampled_from(FrameKind),
     st.integers(0, 2**32 - 1),
