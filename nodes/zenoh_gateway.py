@@ -128,13 +128,18 @@ class ZenohGatewayNode(Node[ZenohGatewayConfig]):
         if self.stopping:
             session.close()
             return
-        config, self.session = self.config, session
-        own = RosNode(session, config.prefix or "/", self.node_name)
-        self.incoming = Incoming(
-            self, own, config.prefix, config.subscribe, config.commands, self.gate, self._no_commands
-        )
-        self.outgoing = Outgoing(self, own, config.prefix, config.publish, self.incoming.wants)
-        session.watch(self.incoming.on_token)
+        config = self.config
+        try:
+            own = RosNode(session, config.prefix or "/", self.node_name)
+            incoming = Incoming(
+                self, own, config.prefix, config.subscribe, config.commands, self.gate, self._no_commands
+            )
+            outgoing = Outgoing(self, own, config.prefix, config.publish, incoming.wants)
+            session.watch(incoming.on_token)
+        except Exception:
+            session.close()  # a client opens another one
+            raise
+        self.session, self.incoming, self.outgoing = session, incoming, outgoing
         self.look()
 
     def try_again(self) -> None:

@@ -1,14 +1,13 @@
 """The gateway between our bus and Zenoh: against raw Zenoh sessions, an independent client, and itself."""
 
 import os
-import threading
 import time
 
 import pytest
 from live_nodes import LiveNode, Neighbour, cdr, wait_for
 
 from instant_ic.bridge.zenoh_format import SENDER_SIZE, Attachment, data_key
-from instant_ic.bridge.zenoh_outgoing import RosPublisher
+from instant_ic.bridge.zenoh_outgoing import Outgoing, RosPublisher
 from instant_ic.bridge.zenoh_session import (
     CLIENT_DEFAULTS,
     ROUTER_DEFAULTS,
@@ -517,6 +516,25 @@ def test_a_client_waits_for_its_router_and_finds_it(tmp_path_factory, monkeypatc
         gateway.close()
 
 
+def test_a_session_whose_topics_cannot_be_set_up_is_closed_and_opened_again(world, monkeypatch):
+    sessions = []
+
+    def outgoing(node, own, *arguments):
+        sessions.append(own.session)
+        if len(sessions) == 1:
+            raise registry.RegistryError("no space left for sockets")
+        return Outgoing(node, own, *arguments)
+
+    monkeypatch.setattr("nodes.zenoh_gateway.Outgoing", outgoing)
+    monkeypatch.setattr("nodes.zenoh_gateway.RETRY_S", 0.2)
+    gateway = world.gateway("robot", commands=COMMANDS, insecure_loopback_commands=True)
+    wait_for(lambda: "messages out" in gateway.told("topics"), "counts of the second session")
+    told = " ".join(text for _, text, _ in gateway.node.diagnoses().values())
+    assert "no space left for sockets" in told
+    assert "AttributeError" not in told
+    assert sessions[0].zenoh.is_closed() and not sessions[1].zenoh.is_closed()
+
+
 @pytest.mark.parametrize(
     ("parameters", "words"),
     [
@@ -557,14 +575,16 @@ def test_rate_limit_thins_and_counts_what_it_leaves_out(world):
     samples = []
 
     def heard(sample):
+        topic = str(sample.key_expr).split("/")[1]
         if b"burst" in sample.payload.to_bytes():
-            samples.append(str(sample.key_expr).split("/")[1])
+            samples.append(topic)
         else:
-            linked.set()
+            linked.add(topic)
 
-    linked = threading.Event()
+    linked = set()
     world.session().zenoh.declare_subscriber("0/*/**", heard)
-    publish_until(fast, String("x"), linked.is_set, "the link")
+    publish_until(fast, String("x"), lambda: "fast" in linked, "the link of /fast")
+    publish_until(all_of_it, String("x"), lambda: "all" in linked, "the link of /all")
     started = time.monotonic()
     for _ in range(40):
         fast.publish(String("burst"))
