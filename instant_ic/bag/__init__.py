@@ -1,4 +1,4 @@
-"""Bags: write and read rosbag2 folders (MCAP) as bytes, replay them in lockstep, compare them (docs/bags.md)."""
+"""Bags in rosbag2's format (MCAP): writing, reading, replay in lockstep and comparison (docs/bags.md)."""
 
 from instant_ic.bag.files import BagReader, TopicSummary
 from instant_ic.bag.message import BagError, BagMessage, DiskFullError, Schema

@@ -1,4 +1,4 @@
-"""Bounded decompression, for our readers and for those of `rosbags`: 19 kB of zstd can expand to 617 MB."""
+"""Bounded decompression for our readers and those of `rosbags`, because 19 kB of zstd can expand to 617 MB."""
 
 from __future__ import annotations
 
@@ -27,14 +27,14 @@ def decompress(data: bytes | memoryview, compression: str, declared_bytes: int |
     Args:
         data: compressed bytes.
         compression: ``zstd`` or ``lz4``; empty for none.
-        declared_bytes: decompressed size that the frame declares; `MOST_CHUNK_BYTES` is the limit in any case.
+        declared_bytes: decompressed size that the frame declares; None if unknown. `MOST_CHUNK_BYTES` always limits it.
 
     Raises:
         ValueError: the data are damaged or larger than declared or allowed, or the compression is unknown.
     """
     most_bytes = MOST_CHUNK_BYTES if declared_bytes is None else declared_bytes
     if most_bytes > MOST_CHUNK_BYTES:
-        raise ValueError(f"it declares {most_bytes} bytes; the limit is {MOST_CHUNK_BYTES}")
+        raise ValueError(f"data declare {most_bytes} bytes; the limit is {MOST_CHUNK_BYTES}")
     if compression == "":
         return bytes(data)
     out: list[bytes] = []
@@ -44,9 +44,9 @@ def decompress(data: bytes | memoryview, compression: str, declared_bytes: int |
             while piece := stream.read(_PIECE):
                 size += len(piece)
                 if size > most_bytes:
-                    raise ValueError(f"it decompresses to more than {most_bytes} bytes, its declared or maximum size")
+                    raise ValueError(f"data decompress to more than {most_bytes} bytes, the declared or maximum size")
                 out.append(piece)
-    except EOFError:  # truncated
+    except EOFError:  # a truncated frame
         pass
     except (RuntimeError, zstandard.ZstdError) as error:  # RuntimeError is raised by lz4
         raise ValueError(str(error)) from None
@@ -87,7 +87,7 @@ def guard_rosbags() -> None:
 
 
 class _BoundedYaml:
-    """Reads ``metadata.yaml`` in the YAML version of `rosbags`, unless its aliases stand for too many values."""
+    """Reader of ``metadata.yaml`` as `rosbags` uses it; refuses text whose aliases expand to too many values."""
 
     def __init__(self, typ: str) -> None:
         from ruamel.yaml import YAML
@@ -98,9 +98,9 @@ class _BoundedYaml:
         """Return the value of a document.
 
         Raises:
-            BagError: it has too many values, or is not YAML.
+            BagError: the document has too many values, or is not YAML.
         """
-        if "*" in text:  # no alias without it
+        if "*" in text:  # every alias begins with it
             try:
                 compose_yaml(text)
             except yaml.YAMLError as error:
@@ -109,12 +109,12 @@ class _BoundedYaml:
 
 
 def _limit_schema(connection: apsw.Connection) -> None:
-    """Limit what the schema of a database may compute, since it comes with the file."""
+    """Limit what the schema of a database may compute, because the schema comes with the file."""
     import apsw
 
     # A column may be computed: the 20 bytes of zeroblob(1000000000) yield a gigabyte.
     connection.limit(apsw.SQLITE_LIMIT_LENGTH, MOST_CHUNK_BYTES)
-    # A view may have rows without end.
+    # A view may yield infinitely many rows.
     connection.config(apsw.SQLITE_DBCONFIG_ENABLE_VIEW, 0)
 
 

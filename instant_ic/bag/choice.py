@@ -1,4 +1,4 @@
-"""Which topics of a bag or of a stack are meant."""
+"""Selection of topics by name or pattern."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class TopicChoice:
-    """Which topics to take.
+    """Topics to take from a bag or a stack.
 
     Attributes:
         topics: names or patterns (``/camera/*``); empty takes all.

@@ -1,4 +1,4 @@
-"""Compares two bags topic by topic, message by message, field by field, with optional tolerances."""
+"""Comparison of two bags by topic, message and field, with optional tolerances."""
 
 from __future__ import annotations
 
@@ -27,8 +27,8 @@ class Tolerance:
         atol: allowed absolute difference of numbers.
         fields: pattern → absolute tolerance of the fields that match it.
         ignore: patterns of fields that are not compared.
-        stamp_s: pair the messages of a topic by stamp, where stamps may differ by this many seconds; None pairs them by
-            order and requires equal stamps.
+        stamp_s: largest difference of stamps, in seconds, at which two messages of a topic form a pair; None pairs
+            messages by order and requires equal stamps.
 
     A pattern matches a field and everything inside it (``header.stamp``, ``pose.*.position``). A topic name before it
     limits it to that topic (``/scan:ranges``). List entries are written ``transforms[].header``.
@@ -68,12 +68,12 @@ EXACT = Tolerance()
 
 @dataclass
 class FieldDifference:
-    """How one field of a topic differs.
+    """The differences of one field of a topic.
 
     Attributes:
-        messages: number of pairs in which it differs beyond the tolerance.
+        messages: number of pairs in which the field differs beyond the tolerance.
         first: number of the first such pair, from 1.
-        largest: largest difference; nan for non-numbers, and where one of the two values is not finite.
+        largest: largest difference; nan for non-numbers, and if one of the two values is not finite.
         words: text of the first difference.
     """
 
@@ -88,11 +88,11 @@ class TopicDifference:
     """The differences of one topic in two bags.
 
     Attributes:
-        first: text of the first difference; empty where the topic is the same in both bags, within the tolerance.
+        first: text of the first difference; empty if the topic is the same in both bags, within the tolerance.
         only_a: messages of the first bag without a partner, when pairing by stamp.
         only_b: messages of the second bag without a partner, when pairing by stamp.
         differing: pairs that differ.
-        fields: field → how it differs in those pairs.
+        fields: field → its differences in those pairs.
     """
 
     topic: str
@@ -113,7 +113,7 @@ class TopicDifference:
 def compare(
     a: Path, b: Path, ignore: tuple[str, ...] = (), common: bool = False, tolerance: Tolerance = EXACT
 ) -> list[TopicDifference]:
-    """Compare every topic of two bags, in the order of the names.
+    """Compare every topic of two bags, sorted by name.
 
     Args:
         a: first bag.
@@ -133,7 +133,7 @@ def compare(
 
 
 class _Comparison:
-    """One topic of two bags."""
+    """A comparison of one topic in two bags."""
 
     def __init__(self, topic: str, one: BagReader, two: BagReader, tolerance: Tolerance) -> None:
         self.topic = topic
@@ -168,7 +168,7 @@ class _Comparison:
         self.first = self.first or text
 
     def _pairs(self) -> Iterator[tuple[BagMessage | None, BagMessage | None]]:
-        """Yield pairs of messages by their order, or by their stamps; None is a missing partner."""
+        """Pair messages by order or by stamp; None stands for a missing partner."""
         one, two = (reader.messages({self.topic}) for reader in self._readers)
         if self.tolerance.stamp_s is None:
             yield from itertools.zip_longest(one, two)
@@ -182,7 +182,7 @@ class _Comparison:
             left, right = next(one, None) if in_a else left, next(two, None) if in_b else right
 
     def _difference(self, left: BagMessage, right: BagMessage, number: int) -> str:
-        """Return how two messages differ, and note the fields that do; empty where they are the same."""
+        """Describe how two messages differ, and count the differing fields; empty if the messages are the same."""
         if self.tolerance.stamp_s is None and left.stamp_ns != right.stamp_ns:
             return f"stamps differ by {(right.stamp_ns - left.stamp_ns) / 1e9:+.9f} s"
         if left.payload == right.payload:
@@ -208,7 +208,7 @@ class _Comparison:
         return self._decoders[key](message.payload)
 
     def _differing_fields(self, a: Any, b: Any) -> dict[str, tuple[str, float]]:
-        """Return name → (text, size) of the fields that differ beyond the tolerance; for a list, its largest."""
+        """Return field → (text, size) of the differences beyond the tolerance; in a list, its largest."""
         found: dict[str, tuple[str, float]] = {}
         for path, x, y in _leaves(a, b, ""):
             name = re.sub(r"\[\d+\]", "[]", path)
@@ -223,7 +223,7 @@ class _Comparison:
 
 
 def _leaves(a: Any, b: Any, path: str) -> Iterator[tuple[str, Any, Any]]:
-    """Yield path and values of the fields of two messages that are no messages themselves."""
+    """Yield path and both values of every field that is not itself a message."""
     if dataclasses.is_dataclass(a):
         for item in dataclasses.fields(a):
             if not item.name.startswith("__"):
@@ -237,9 +237,10 @@ def _leaves(a: Any, b: Any, path: str) -> Iterator[tuple[str, Any, Any]]:
 
 
 def _difference(a: Any, b: Any, atol: float) -> tuple[str, float] | None:
-    """Return how two values differ, as text and as a number (nan for non-numbers); None within the tolerance.
+    """Return the difference of two values as text and number (nan for non-numbers); None within the tolerance.
 
-    Without a tolerance numbers are compared bit for bit: -0.0 differs from 0.0, two nan are equal if their bits are.
+    Without a tolerance, numbers are compared bit for bit: -0.0 differs from 0.0, and two nan with the same bits are
+    equal.
     """
     if isinstance(a, np.ndarray | list) and isinstance(b, np.ndarray | list) and len(a) != len(b):
         return f" has {len(a)} and {len(b)} entries", math.nan
@@ -270,7 +271,7 @@ def _numeric(value: Any) -> bool:
     return isinstance(value, np.ndarray) or (isinstance(value, int | float) and not isinstance(value, bool))
 
 
-@functools.lru_cache(maxsize=10_000)  # asked for each field of each message
+@functools.lru_cache(maxsize=10_000)  # called for each field of each message
 def _matches(pattern: str, topic: str, path: str) -> bool:
     if pattern.startswith("/"):
         wanted, _, pattern = pattern.partition(":")

@@ -1,4 +1,4 @@
-"""Reads bags as bytes, by `rosbags`: rosbag2 folders (MCAP and SQLite), bare ``.mcap`` and ``.db3`` files."""
+"""Reading of bags as bytes with `rosbags`: rosbag2 folders (MCAP and SQLite), single ``.mcap`` and ``.db3`` files."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class TopicSummary:
 
     @property
     def problem(self) -> str:
-        """Why nodes here cannot read its messages; empty where they can."""
+        """Reason why our nodes cannot read the topic's messages; empty if they can."""
         own = schema_or_unknown(self.type_name)
         if not own.encoding and self.schema.encoding != "ros2msg":
             return "its type is unknown, and the bag has no definition of it"
@@ -49,9 +49,9 @@ class TopicSummary:
 
 
 class BagReader(Closing):
-    """Reads a bag; a context manager.
+    """Reader of a bag; a context manager.
 
-    Latched values that a recorder repeats at the start of each file are returned once.
+    A recorder repeats latched values at the start of each file. They are returned once.
 
     Args:
         path: rosbag2 folder, ``.mcap`` or ``.db3`` file.
@@ -100,7 +100,7 @@ class BagReader(Closing):
 
     @property
     def count(self) -> int:
-        """Messages, with the latched values that the files of a recorder repeat."""
+        """Number of messages, including latched values repeated at the start of each file."""
         return int(self._reader.message_count)
 
     @property
@@ -173,8 +173,8 @@ class BagReader(Closing):
             encoding = getattr(connection.ext, "serialization_format", "cdr")
             if encoding != "cdr" and connection.msgcount:
                 raise BagError(
-                    f"bag {self.path}, topic {connection.topic}: its messages are {encoding!r}, not CDR. Choose other "
-                    f"topics, or copy those in CDR: ic bag recover {self.path}"
+                    f"bag {self.path}, topic {connection.topic}: the messages are {encoding!r}, not CDR. Choose other "
+                    f"topics, or copy the CDR topics into a new bag: ic bag recover {self.path}"
                 )
         presets = {(c.topic, c.msgtype): _qos(c) for c in connections}
         upgrades = (
@@ -193,7 +193,7 @@ class BagReader(Closing):
             raise BagError(f"bag {self.path} is damaged: {error}; try ic bag recover {self.path}") from None
 
     def decoder(self, topic: TopicSummary) -> Callable[[bytes], Any]:
-        """Return a function that decodes a topic's bytes: by our type, or by the bag's definition where that differs.
+        """Return a function that decodes a topic's bytes by our type, or by the bag's definition if the two differ.
 
         Raises:
             BagError: the type is unknown.
@@ -218,7 +218,7 @@ class BagReader(Closing):
         if self._reader.compression_mode == "message":
             yield from self._reader.messages(connections, start_ns, stop_ns)
             return
-        # Merge by stamp: files are not in stamp order where a clock was set back or files overlap.
+        # Merge by stamp: files are out of stamp order if a clock was set back or files overlap.
         wanted = {(c.topic, c.msgtype) for c in connections}
         chosen = [(s, [c for c in s.connections if (c.topic, c.msgtype) in wanted]) for s in self._storages]
         streams = [storage.messages(its, start_ns, stop_ns) for storage, its in chosen if its]

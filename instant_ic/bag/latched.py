@@ -10,7 +10,7 @@ from instant_ic.msg import MessageError, deserialize
 
 
 class LatchedValues:
-    """Keeps the last message of each latched topic and publisher.
+    """The last message of each latched topic and publisher.
 
     On ``/tf_static`` every message carries all frames of its publisher. A message replaces the earlier messages whose
     frames it repeats, from any publisher.
@@ -30,18 +30,18 @@ class LatchedValues:
 
 
 class Repetitions:
-    """Finds the latched values with which a later file of a bag only repeats those of an earlier one.
+    """Filter for the latched values that each later file of a bag repeats from the earlier files.
 
     Args:
-        starts_ns: stamp of the first message of each file but the first; may grow.
+        starts_ns: stamp of the first message of each file except the first; may grow.
     """
 
     def __init__(self, starts_ns: Iterable[int] = ()) -> None:
         self.starts_ns = set(starts_ns)
-        self._seen: set[int] = set()  # hashes: a map has megabytes
+        self._seen: set[int] = set()  # hashes, because a map has megabytes
 
     def repeats(self, message: BagMessage) -> bool:
-        """Note a message; return whether it repeats an earlier one."""
+        """Remember a message, and return whether it repeats an earlier one."""
         if not message.qos.latched:
             return False
         value = hash((message.topic, message.payload))

@@ -1,4 +1,4 @@
-"""The nodes that run beside a player: would its messages reach a robot, and are its readers ready?"""
+"""Checks of the nodes that run beside a player: no played message may reach a robot, and readers must be ready."""
 
 from __future__ import annotations
 
@@ -15,20 +15,20 @@ from instant_ic.bus.topics import Publisher
 _WAIT_S = 60.0
 _BASE = "crawler_base"
 _BRIDGES = ("host_bridge", "zenoh_gateway")
-"""Pass what they subscribe to on to a robot on another machine."""
+"""Nodes that forward their subscriptions to a robot on another machine."""
 _COMMAND = "/cmd_vel"
 _ACTED_ON = (
     *("/cmd_vel", "/nav/cmd_vel", "/operator/*", "/robot/estop", "/ic/*", "/vbot/odom"),
-    *("/view/shown", "/vspace/status"),  # whether the operator sees recent images
-    *("/initialpose", "/slam/*"),  # where the robot is, and whether that is trusted
+    *("/view/shown", "/vspace/status"),  # age of the images that the operator sees
+    *("/initialpose", "/slam/*"),  # the robot's pose, and whether it is trusted
 )
-"""Topics that a robot's nodes act on, in the namespace of its base."""
+"""Topics on which a robot's nodes act, in the namespace of its base."""
 _HARMLESS = {"/clock", *EVERY_NODES}
-"""On any other topic a second publisher would mix the bag with the live robot."""
+"""Topics that may be played beside a robot. On others, a second publisher would mix the bag with the live robot."""
 
 
 def _reached_base(nodes: Collection[NodeInfo], played: Mapping[str, str]) -> tuple[str, list[str]] | None:
-    """Return the name of a base or bridge, and the topics of the bag that would reach its robot; None without one."""
+    """Return a base or bridge, and the topics of the bag that would reach its robot; None if no topic would."""
     live = {topic for node in nodes for topic in node.publishes} - _HARMLESS
     for base in nodes:
         if base.executable == _BASE:
@@ -49,7 +49,7 @@ def _reached_base(nodes: Collection[NodeInfo], played: Mapping[str, str]) -> tup
 
 
 def refuse_base(bag: str, run_dir: Path, nodes: Collection[NodeInfo], played: Mapping[str, str]) -> None:
-    """Refuse to play what a base in the run directory, real or simulated, could obey, also one behind a bridge.
+    """Refuse to play topics that a base could obey, whether real or simulated, in the run directory or behind a bridge.
 
     Args:
         bag: name of the bag, for the error.
@@ -58,7 +58,7 @@ def refuse_base(bag: str, run_dir: Path, nodes: Collection[NodeInfo], played: Ma
         played: topic on the bus → topic in the bag.
 
     Raises:
-        BagError: there is one, or a bridge to one.
+        BagError: a played topic would reach a base, directly or through a bridge.
     """
     if reached := _reached_base(nodes, played):
         base, topics = reached
@@ -73,16 +73,16 @@ def refuse_base(bag: str, run_dir: Path, nodes: Collection[NodeInfo], played: Ma
 def wait_for_readers(
     wait_for: Collection[str], run_dir: Path, publishers: Mapping[str, Publisher], wait: Callable[[float], bool]
 ) -> None:
-    """Wait until nodes are connected to everything that is played.
+    """Wait until nodes are connected to all played topics to which they subscribe.
 
     Args:
-        wait_for: names of the nodes, which must subscribe to at least one played topic.
+        wait_for: names of the nodes. Each must subscribe to at least one played topic.
         run_dir: run directory of the nodes.
         publishers: topic in the bag → its publisher.
-        wait: waits for some seconds; returns True to give up.
+        wait: function that waits for the given seconds and returns True to give up.
 
     Raises:
-        BagError: they are not after a minute.
+        BagError: a node is still not connected after a minute.
     """
     deadline_s = time.monotonic() + _WAIT_S
     missing: list[str] = []
@@ -96,8 +96,8 @@ def wait_for_readers(
 def _missing(wait_for: Collection[str], nodes: Collection[NodeInfo], publishers: Mapping[str, Publisher]) -> list[str]:
     running = {node.name: node for node in nodes if node.name in wait_for}
     played = {out.topic for out in publishers.values()}
-    # A recorder subscribes only after it has found the topics: it is ready once it subscribes to one of them.
+    # A recorder subscribes only after it has found the topics. Its first subscription to a played topic makes it ready.
     absent = [name for name in wait_for if name not in running or played.isdisjoint(running[name].subscribes)]
     readers = [topic for node in running.values() for topic in node.subscribes]
     unread = [name for name, out in publishers.items() if out.subscriber_count < readers.count(out.topic)]
-    return [f"node {name} to read what is played" for name in absent] + [f"a reader of {name}" for name in unread]
+    return [f"node {name} to read a played topic" for name in absent] + [f"a reader of {name}" for name in unread]

@@ -1,7 +1,7 @@
-"""Reads an MCAP file from its beginning, without its index, as far as possible: complete, truncated or damaged.
+"""Sequential reading of an MCAP file without its index, as far as a truncated or damaged file allows.
 
 The readers of `mcap` and `rosbags` stop at a truncated end, or return a value that is too short. Here each record is
-cut out by its length first, then parsed by the `mcap` package; chunks are decompressed within the limits of
+first cut out by its length, then parsed by the `mcap` package. Chunks are decompressed within the limits of
 ``bounded.py``.
 """
 
@@ -25,7 +25,7 @@ from instant_ic.bag.bounded import decompress
 from instant_ic.bag.message import BagError, Schema
 
 _MOST_DAMAGED = 1000
-"""Damaged records that are listed; a hostile file may contain nothing else."""
+"""Limit of the list of damaged records, because a hostile file may contain nothing else."""
 _HEAD = struct.Struct("<BQ")
 _KINDS: dict[int, Any] = {
     Opcode.SCHEMA: records.Schema,
@@ -39,7 +39,7 @@ class ScannedMessage:
     """A message in an MCAP file.
 
     Attributes:
-        channel: topic, encoding (``cdr`` in ROS 2 bags) and metadata, where rosbag2 stores the QoS.
+        channel: topic, encoding (``cdr`` in ROS 2 bags) and metadata, in which rosbag2 stores the QoS.
         stamp_ns: log time.
     """
 
@@ -56,7 +56,7 @@ class McapScan:
         BagError: the file cannot be opened, or is not an MCAP file.
 
     Attributes:
-        stopped_by: reason why reading stopped before the end of the file; empty when it did not.
+        stopped_by: reason why reading stopped before the end of the file; empty if the file was read to its end.
         damaged: descriptions of damaged chunks and records that were skipped.
         metadata: metadata records, name → values; the last record of each name.
     """
@@ -95,7 +95,7 @@ class McapScan:
             self.damaged.append(f"{place}: {error or 'a value is missing'}")
 
     def _chunk(self, body: memoryview, at: int, complete: bool) -> Iterator[ScannedMessage]:
-        """Yield the messages of a chunk; those of an incomplete chunk end where it ends."""
+        """Yield the messages of a chunk, or the complete messages at the start of an incomplete chunk."""
         try:
             content = _chunk_content(body, complete)
         except Exception as error:  # noqa: BLE001 - the parser may raise anything on damaged bytes
@@ -109,7 +109,7 @@ class McapScan:
                 yield message
 
     def _record(self, opcode: int, body: memoryview, place: str) -> ScannedMessage | None:
-        """Return a message, or store a definition; unknown kinds, as of later versions of the format, are ignored."""
+        """Return a message, or store a definition. Unknown records of later format versions are ignored."""
         stream = _RecordBody(BytesIO(body))
         try:
             if opcode == Opcode.MESSAGE:
@@ -129,10 +129,10 @@ class McapScan:
             self.metadata[record.name] = record.metadata
 
     def _message(self, message: records.Message) -> ScannedMessage:
-        """Return a message with its definition, which has no text where it is in no encoding of ROS 2.
+        """Return a message with its definition. A definition in an encoding other than ROS 2's is left empty.
 
         Raises:
-            ValueError: its topic is unknown, or its definition is no text.
+            ValueError: the message's topic is unknown, or its definition is not text.
         """
         channel = self._channels.get(message.channel_id)
         if channel is None:
@@ -145,7 +145,7 @@ class McapScan:
 
 
 class _RecordBody(ReadDataStream):
-    """The body of a record; a value that is longer than the body is an error."""
+    """The body of a record. Reading a value that is longer than the body is an error."""
 
     def read(self, length: int) -> bytes:
         data = super().read(length) if length else b""
@@ -158,7 +158,7 @@ def _mapped(path: Path) -> memoryview:
     """Return the bytes of a file.
 
     Raises:
-        BagError: it cannot be opened, or does not begin as an MCAP file.
+        BagError: the file cannot be opened, or does not begin like an MCAP file.
     """
     try:
         with path.open("rb") as file:
@@ -173,7 +173,7 @@ def _mapped(path: Path) -> memoryview:
 
 
 def _records(data: memoryview, at: int) -> Iterator[tuple[int, int, memoryview, bool]]:
-    """Yield place, opcode and body of each record, and whether it is complete; only the last one may not be."""
+    """Yield offset, opcode, body and completeness of each record. Only the last record may be incomplete."""
     while at < len(data):
         opcode, length = _HEAD.unpack_from(data, at) if at + _HEAD.size <= len(data) else (0, len(data))
         begin, end = at + _HEAD.size, at + _HEAD.size + length
@@ -182,10 +182,10 @@ def _records(data: memoryview, at: int) -> Iterator[tuple[int, int, memoryview, 
 
 
 def _chunk_content(body: memoryview, complete: bool) -> memoryview:
-    """Return the records of a chunk; those of an incomplete chunk end where it ends.
+    """Return the records of a chunk, or the readable part of an incomplete chunk.
 
     Raises:
-        Exception: it is damaged, or larger than declared or allowed.
+        Exception: the chunk is damaged, or larger than declared or allowed.
     """
     chunk = records.Chunk.read(ReadDataStream(BytesIO(body)))
     content = decompress(chunk.data, chunk.compression, chunk.uncompressed_size)

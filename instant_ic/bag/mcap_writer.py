@@ -1,7 +1,7 @@
-"""Writes one MCAP file (https://mcap.dev/spec) by the `mcap` package.
+"""Writing of one MCAP file (https://mcap.dev/spec) with the `mcap` package.
 
-The package's writer cannot go on after a failed write. Then the file is cut back to its last complete chunk and closed:
-``ic bag recover`` reads it.
+The package's writer cannot continue after a failed write. The file is then cut back to its last complete chunk and
+closed, and ``ic bag recover`` can read it.
 """
 
 from __future__ import annotations
@@ -20,13 +20,13 @@ from instant_ic.bag.metadata import Topics, channel_metadata
 from instant_ic.util.private import open_file
 
 CHUNK_BYTES = 1 << 20
-"""A chunk is closed once it is larger than this."""
+"""Size at which a chunk is closed."""
 
 Buffer = bytes | memoryview
 
 
 class _File:
-    """Unbuffered stream of a new file that only its owner can read."""
+    """An unbuffered stream of a new file that only its owner can read."""
 
     def __init__(self, path: Path) -> None:
         self.fd = open_file(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL)
@@ -43,7 +43,7 @@ class _File:
         return self.offset
 
     def flush(self) -> None:
-        """Do nothing: nothing is buffered."""
+        """Do nothing, because nothing is buffered."""
 
     def close(self) -> None:
         """Write the file to the disk itself and close it."""
@@ -54,7 +54,7 @@ class _File:
 
 
 class McapWriter:
-    """One MCAP file of CDR messages; not thread-safe. After an error of a write it is closed.
+    """One MCAP file of CDR messages; not thread-safe. A failed write closes it.
 
     Args:
         path: the file, which must not exist; only its owner can read it.
@@ -64,11 +64,11 @@ class McapWriter:
     Attributes:
         given: messages passed to :meth:`write`, by topic.
         counts: messages in complete chunks on the disk, by topic.
-        first_ns: stamp of the first message; None before it.
+        first_ns: stamp of the first message; None if there is none yet.
         span_ns: first and last stamp in complete chunks; (0, 0) if there are none.
 
     Raises:
-        OSError: in all methods: the disk is full, or failed; the file ends with its last complete chunk.
+        OSError: in all methods: the disk is full, or failed. The file then ends with its last complete chunk.
     """
 
     def __init__(self, path: Path, topics: Topics, compressed: bool = False) -> None:
@@ -94,19 +94,19 @@ class McapWriter:
 
     @property
     def size(self) -> int:
-        """Bytes so far; the open chunk counts uncompressed."""
+        """Size in bytes so far, in which the open chunk counts uncompressed."""
         return self._file.offset + self._open_bytes
 
     @property
     def lost(self) -> Counter[str]:
-        """Messages by topic that are in no complete chunk; once the file is closed, they are lost."""
+        """Messages by topic that are in no complete chunk. They are lost when the file is closed after an error."""
         lost: Counter[str] = Counter()
         for (name, _), count in (self.given - self.counts).items():
             lost[name] += count
         return lost
 
     def add_topic(self, topic: Topic) -> int:
-        """Add a topic with its type, once; return its number in this file."""
+        """Add a topic with its type, unless the file has it, and return its number in this file."""
         if topic not in self._channels:
             qos, schema = self._topics[topic]
             if schema.name not in self._schemas:
@@ -129,7 +129,7 @@ class McapWriter:
 
     def add_metadata(self, name: str, values: Mapping[str, str]) -> None:
         """Write a metadata record before the open chunk."""
-        opened, self._open = self._open, []  # this completes no chunk
+        opened, self._open = self._open, []  # a metadata record completes no chunk
         self._put(self._writer.add_metadata, name, dict(values))
         self._open = opened
 
@@ -142,7 +142,7 @@ class McapWriter:
         self._put(os.fdatasync, self._file.fd)
 
     def finish(self) -> None:
-        """Write the open chunk, index and footer, to the disk itself, and close the file."""
+        """Write the open chunk, index and footer to the disk itself, and close the file."""
         self.flush()
         self._put(self._writer.finish)
         self._file.close()

@@ -1,4 +1,4 @@
-"""A bag's message as bytes with topic, type, stamp and QoS, the definition of its type, and the errors of bags."""
+"""Messages in a bag as bytes, definitions of their types, and errors of bags."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ class BagError(RuntimeError):
 
 
 class DiskFullError(BagError):
-    """No space left on the disk. The bag is complete except for the messages that did not fit."""
+    """The disk is full. The bag is complete except for the messages that did not fit."""
 
 
 @dataclass(frozen=True)
@@ -24,9 +24,9 @@ class Schema:
 
     Attributes:
         name: type name, for example ``sensor_msgs/msg/Image``.
-        encoding: ``ros2msg`` or ``ros2idl``; empty where the definition is unknown.
+        encoding: ``ros2msg`` or ``ros2idl``; empty if the definition is unknown.
         text: the definition, including those of nested types.
-        type_hash: RIHS01 hash; empty where it is unknown.
+        type_hash: RIHS01 hash; empty if unknown.
     """
 
     name: str
@@ -37,14 +37,14 @@ class Schema:
 
 @dataclass(frozen=True)
 class BagMessage:
-    """A message in a bag, or on its way into one.
+    """A message that is in a bag, or that will be written into one.
 
     Attributes:
         type_name: message type, for example ``sensor_msgs/msg/Image``.
         payload: CDR bytes.
         stamp_ns: time of publication, nanoseconds since the epoch.
-        qos: QoS of its publisher; from a bag, the preset closest to it.
-        publisher: name of its publisher, where it is known.
+        qos: QoS of its publisher; for a message read from a bag, the closest preset.
+        publisher: name of its publisher; empty if unknown.
     """
 
     topic: str

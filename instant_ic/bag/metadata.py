@@ -47,16 +47,16 @@ def own_schema(type_name: str) -> Schema:
 
 
 def schema_or_unknown(type_name: str) -> Schema:
-    """Return :func:`own_schema` of a type; without a definition where it is unknown, as rosbag2 does."""
+    """Return the definition of a type; an empty definition if the type is unknown, as rosbag2 writes it."""
     try:
         return own_schema(type_name)
-    except (MessageError, TypesysError):  # TypesysError: a type of ours, but not by this full name
+    except (MessageError, TypesysError):  # TypesysError: one of our types under a wrong full name
         return Schema(type_name, "", "", "")
 
 
 @functools.lru_cache(maxsize=200)
 def store_of(schema: Schema) -> Any:
-    """Return a type store with the types of a definition in a bag."""
+    """Return a type store with the types that a bag's definition contains."""
     from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
     store = get_typestore(Stores.EMPTY)
@@ -66,8 +66,8 @@ def store_of(schema: Schema) -> Any:
 
 @functools.lru_cache(maxsize=200)
 def with_hash(schema: Schema) -> Schema:
-    """Add the RIHS01 hash of the definition. A missing definition is replaced by ours, a damaged one is emptied."""
-    if not schema.encoding or not schema.text:  # old SQLite bags store none
+    """Add the RIHS01 hash of a definition. A missing definition is replaced by ours; a damaged one is emptied."""
+    if not schema.encoding or not schema.text:  # old SQLite bags store no definitions
         return schema_or_unknown(schema.name)
     if schema.type_hash or schema.encoding != "ros2msg":
         return schema
@@ -105,10 +105,10 @@ def ros_qos(qos: QoS) -> Qos:
 
 
 def profiles_of(profiles: list[Any] | str) -> list[Qos]:
-    """Return the profiles of a topic, for `rosbags`, whose own YAML parser takes milliseconds for each topic of a file.
+    """Return the QoS profiles of a topic for `rosbags`, whose own YAML parser takes milliseconds per topic and file.
 
     Args:
-        profiles: YAML, as MCAP and SQLite files hold it, or what ``metadata.yaml`` holds.
+        profiles: YAML text from an MCAP or SQLite file, or the parsed value from ``metadata.yaml``.
 
     Raises:
         ReaderError: the text is not a list in YAML.
@@ -127,9 +127,9 @@ def _profiles(text: str) -> tuple[Qos, ...]:
     return tuple(parse_qos(found or []))
 
 
-@functools.lru_cache(maxsize=200)  # asked once per message
+@functools.lru_cache(maxsize=200)  # called once per message
 def preset_of_text(profiles: str) -> QoS:
-    """Return :func:`preset_of` of the text in an MCAP file; ``reliable`` where the text is damaged."""
+    """Return the closest preset for the QoS text of an MCAP file; ``reliable`` if the text is damaged."""
     try:
         return preset_of(profiles_of(profiles))
     except Exception:  # noqa: BLE001 - a parser may raise anything on damaged YAML
@@ -137,7 +137,7 @@ def preset_of_text(profiles: str) -> QoS:
 
 
 def preset_of(profiles: Collection[Qos]) -> QoS:
-    """Return the preset closest to a topic's offered QoS; ``reliable`` where the bag has none."""
+    """Return the preset closest to a topic's offered QoS; ``reliable`` if the bag stores no QoS."""
     profile = next(iter(profiles), None)
     if profile is None:
         return RELIABLE

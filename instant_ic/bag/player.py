@@ -1,4 +1,4 @@
-"""Plays a bag in real time or at another rate; can be paused and stepped."""
+"""Playback of a bag in real time or at another rate, with pause and single steps."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ from instant_ic.bus.heartbeat import EVERY_NODES
 from instant_ic.config.ranges import Checked, NotNegative, Range
 
 NEVER_PLAYED = ("/clock", *EVERY_NODES)
-"""The time itself, and what nodes report about themselves: the running nodes publish their own."""
+"""Topics of the clock and of the nodes' reports about themselves, because running nodes publish their own."""
 
 CLOCK_HZ = 40.0
-"""Lowest rate of ``/clock``, also while paused and in gaps of the bag."""
+"""Lowest rate of ``/clock``, even while paused and in gaps of the bag."""
 
 RATES = (0.01, 100.0)
 """Smallest and largest rate that can be set during playback."""
@@ -34,16 +34,16 @@ class BagPlayerConfig(Checked):
         bag: folder of the bag, or a ``.mcap`` or ``.db3`` file.
         rate: 2 plays twice as fast.
         start_offset_s: seconds to skip at the start; latched messages from the skipped part are still published.
-        duration_s: seconds of the bag to play; 0 plays to the end.
+        duration_s: length of the played part in seconds; 0 plays to the end.
         loop: restart at the end; the time then jumps back.
         start_paused: wait at the start until resumed or stepped.
         topics: names or patterns of the topics to play; empty plays everything.
         exclude: names or patterns of the topics to leave out.
         drop_transforms: child frames whose transforms are left out of ``/tf`` because another node broadcasts them.
         publish_clock: whether to publish ``/clock``.
-        delay_s: seconds for which the time stands still at the start, so that subscribers find the topics.
+        delay_s: seconds to wait at the first stamp, so that subscribers find the topics.
         wait_for: nodes that must run, with all their subscriptions connected, before playback starts.
-        force: play commands and states although a base is running, which may move the robot.
+        force: play commands and states although a base is running. This may move the robot.
     """
 
     bag: str = ""
@@ -67,10 +67,10 @@ class BagPlayerConfig(Checked):
 
 
 class BagPlayer:
-    """Paces the messages of a bag, independent of the bus. Its controls may be called from any thread.
+    """Pacing of a bag's messages, independent of the bus. Its controls may be called from any thread.
 
     Raises:
-        BagError: there is no bag, or it has nothing to play.
+        BagError: there is no bag, or the selection is empty.
     """
 
     def __init__(self, options: BagPlayerConfig) -> None:
@@ -80,7 +80,7 @@ class BagPlayer:
         self.left_out: dict[str, str] = {}
         """Topics and types that are not sent, with the reason."""
         chosen: dict[str, TopicSummary] = {}
-        # Of a topic with several types, play the one with most messages: a publisher has one type.
+        # A publisher has one type: if a topic has several, play the one with the most messages.
         for topic in sorted(self._reader.topics, key=lambda topic: -topic.count):
             if topic.topic in NEVER_PLAYED or not choice.takes(topic.topic):
                 continue
@@ -107,7 +107,7 @@ class BagPlayer:
         self.sent = 0
         """Messages sent."""
         self.latest_s = 0.0
-        """Lag of the latest message in seconds: positive when the machine or the receiver is slower than the bag."""
+        """Delay of the latest message in seconds: positive if the machine or the receiver is slower than the bag."""
         self.rate = options.rate
         """Playback speed; 2 plays twice as fast."""
         self.paused = options.start_paused
@@ -126,7 +126,7 @@ class BagPlayer:
         """Change the playback speed.
 
         Raises:
-            ValueError: outside :data:`RATES`.
+            ValueError: the rate is outside :data:`RATES`.
         """
         if not RATES[0] <= rate <= RATES[1]:
             raise ValueError(f"rate must lie in {RATES[0]:g}..{RATES[1]:g} (got {rate})")
@@ -179,8 +179,8 @@ class BagPlayer:
             send: called with each message when it is due.
             stop: ends playback; also interrupts waiting.
             now_s: monotonic time in seconds.
-            on_clock: called with the bag's time, first at the start and then periodically; in between,
-                :attr:`position_ns` is valid.
+            on_clock: called with the bag's time at the start and then periodically. Between two calls, read
+                :attr:`position_ns`.
 
         Returns:
             Whether playback reached the end.

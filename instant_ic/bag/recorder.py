@@ -1,7 +1,7 @@
-"""Records topics without decoding them, finds new publishers while it runs, and counts losses.
+"""Recording of topics as bytes, with discovery of new publishers and counts of lost messages.
 
-Without snapshots the recorder writes one bag from its start to its end. In snapshot mode it keeps the last seconds in
-memory, writes them into a bag on request, and records into a further bag between two commands.
+By default the recorder writes one bag from its start to its end. In snapshot mode it keeps the last seconds in memory
+and writes them into a bag on request. Between the commands ``record`` and ``stop`` it also records into another bag.
 """
 
 from __future__ import annotations
@@ -26,10 +26,10 @@ from instant_ic.bus.transport import Stats
 from instant_ic.util.diagnosis import Diagnosis, Level, RecentCount
 
 FOREIGN_CLOCK_NS = 10_000_000_000
-"""A stamp farther than this from the simulated clock comes from another clock."""
+"""Difference from the simulated clock above which a stamp must come from another clock."""
 
 _MB = 1_000_000
-_RECENT_S = 10.0  # losses longer ago are no warning
+_RECENT_S = 10.0  # older losses cause no warning
 _IDLE = "idle"
 
 TakeMessage = Callable[..., None]
@@ -38,13 +38,13 @@ Subscribe = Callable[[str, TakeMessage], Stats]
 
 
 class Recorder:
-    """The recorder, independent of the bus: the caller reports publishers and passes bytes.
+    """The recorder, independent of the bus. The caller reports publishers and passes bytes.
 
     Args:
         path: the bag's folder; in snapshot mode, the parent folder of the bags.
         subscribe: ``(topic, take)`` subscribes to raw bytes and returns the counter of lost messages.
-        sim_now_ns: the simulated clock, if there is one. Nodes that do not follow it (the recorder itself, the console)
-            stamp with the machine's time; their messages get the simulated time of their arrival instead.
+        sim_now_ns: returns the simulated time; None without simulation. Nodes that do not follow it (this recorder, the
+            console) stamp with the machine's time, and their messages get the simulated time of their arrival instead.
         free_bytes: free space on the bag's disk; replaced in tests.
 
     Attributes:
@@ -90,11 +90,11 @@ class Recorder:
         return any(bag.failed for bag in self._bags)
 
     def discover(self, topics: Collection[TopicInfo], nodes: Collection[NodeInfo] = ()) -> None:
-        """Subscribe to new selected topics and store the parameters of nodes."""
+        """Subscribe to newly found topics of the selection, and store the parameters of nodes."""
         for info in topics:
             if info.topic not in self._losses and self._choice.takes(info.topic):
                 offered = [PRESETS.get(publisher.qos, SENSOR) for publisher in info.publishers]
-                # With several publishers of one topic, a reader must know that it is latched if any of them is.
+                # A topic counts as latched if any of its publishers is.
                 self._qos[info.topic] = max(offered, key=lambda qos: (qos.latched, qos.reliable))
                 self._losses[info.topic] = self._subscribe(info.topic, self.take)
         for node in nodes:
@@ -103,9 +103,9 @@ class Recorder:
     def take(
         self, topic: str, type_name: str, payload: bytes | memoryview, publish_ns: int, publisher: str = ""
     ) -> None:
-        """Queue one message; never waits. The payload is copied, since its memory may be overwritten."""
+        """Queue one message without waiting. The payload is copied, because its memory may be overwritten."""
         stamp_ns = self._stamp_ns(publish_ns)
-        if stamp_ns <= 0:  # from a node on simulated time before the first /clock: it has no time
+        if stamp_ns <= 0:  # sent by a node on simulated time that has not received /clock yet
             return
         message = BagMessage(topic, type_name, bytes(payload), stamp_ns, self._qos.get(topic, SENSOR), publisher)
         if self._cache is not None:
@@ -114,10 +114,10 @@ class Recorder:
             bag.put(message)
 
     def record(self, name: str = "") -> Path:
-        """Start a bag ``rec_DATE_TIME_NAME`` and return its folder; for snapshot mode.
+        """Start a bag ``rec_DATE_TIME_NAME`` in snapshot mode, and return its folder.
 
         Raises:
-            ValueError: a bag is being recorded or completed, or the recorder is not in snapshot mode.
+            ValueError: another bag is being recorded or completed, or the recorder is not in snapshot mode.
             BagError: the bag cannot be created.
         """
         cache = self._snapshot_cache()
@@ -130,7 +130,7 @@ class Recorder:
         return self.bag.path
 
     def stop(self) -> Path:
-        """Stop the bag that :meth:`record` started. What is queued is written in the background (see :meth:`status`).
+        """Stop the bag that :meth:`record` started. Queued messages are written in the background (see :meth:`status`).
 
         Raises:
             ValueError: no bag is being recorded, or the recorder is not in snapshot mode.
@@ -142,16 +142,16 @@ class Recorder:
         return self.bag.path
 
     def snapshot(self, reason: str = "", after_s: float = 0.0) -> Recording:
-        """Begin a bag ``DATE_TIME_REASON`` with the messages in memory, which ends after ``after_s`` more seconds.
+        """Write a bag ``DATE_TIME_REASON`` with the messages in memory and those of the next ``after_s`` seconds.
 
         Raises:
-            ValueError: not in snapshot mode, or no message has been received.
+            ValueError: the recorder is not in snapshot mode, or no message has been received.
         """
         content = self._snapshot_cache().content()
         if not content:
-            raise ValueError("no message has been received yet: there is nothing to write")
+            raise ValueError("no message has been received yet, so there is nothing to write")
         for snapshot in self.snapshots:
-            if snapshot.state == RECORDING:  # it contains this moment too
+            if snapshot.state == RECORDING:  # a running snapshot includes this moment
                 return snapshot
         path, until_s = _dated(self.path, reason), time.monotonic() + after_s
         self.snapshots.append(self._open(path, content, until_s))
@@ -159,7 +159,7 @@ class Recorder:
         return self.snapshots[-1]
 
     def tick(self) -> None:
-        """End the snapshots that are complete."""
+        """End the snapshots whose time is over."""
         for bag in self._bags:
             bag.tick()
 
@@ -171,8 +171,8 @@ class Recorder:
     def status(self) -> dict[str, Any]:
         """Return the values that ``ic bag control status`` and the page show.
 
-        In snapshot mode ``recording`` describes the bag that is being recorded, or the last one; its state is ``idle``
-        when none is.
+        In snapshot mode ``recording`` describes the bag that is being recorded, or else the last one. Its state is
+        ``idle`` if no bag is being recorded.
         """
         status: dict[str, Any] = {"topics": len(self._losses), "lost": self.lost_by()}
         bag = self.bag.status() if self.bag is not None else {}
@@ -198,7 +198,7 @@ class Recorder:
         now_lost = self._recent_lost.rise(lost.total(), now_ns)
         fault = (self.bag.error if self.bag is not None else "") or self._low_disk()
         if self._recent_dropped.rise(overflow.total(), now_ns) and not fault:
-            fault = f"{self._summary()}; the disk is too slow, dropped: {counts_text(overflow)}"
+            fault = f"{self._summary()}; the disk is too slow; dropped: {counts_text(overflow)}"
         if fault:
             yield Diagnosis("bag", Level.ERROR, fault)
         else:
@@ -208,7 +208,7 @@ class Recorder:
             yield Diagnosis("bag", Level.WARN if now_lost else Level.OK, text, values)
 
     def close(self, timeout_s: float = 30.0) -> None:
-        """Complete all bags; their metadata contain the losses and the nodes' parameters.
+        """Complete all bags. Their metadata contain the losses and the nodes' parameters.
 
         Raises:
             BagError: a bag could not be written completely.
@@ -235,7 +235,7 @@ class Recorder:
         until_s: float = math.inf,
         lost_before: Mapping[str, Mapping[str, int]] | None = None,
     ) -> Recording:
-        """Return a new bag; its metadata contain the losses since ``lost_before``."""
+        """Begin a bag whose metadata contain the losses since ``lost_before``."""
         before = lost_before or {}
 
         def custom() -> dict[str, Any]:
@@ -246,7 +246,7 @@ class Recorder:
 
     def _snapshot_cache(self) -> SnapshotCache:
         if self._cache is None:
-            raise ValueError("the recorder records all the time: start it with --snapshot to record on request")
+            raise ValueError("the recorder records all the time; start it with --snapshot to record on request")
         return self._cache
 
     def _stamp_ns(self, publish_ns: int) -> int:
@@ -262,14 +262,14 @@ class Recorder:
             return None
 
     def _low_disk(self) -> str:
-        """Return in snapshot mode that the disk is too full for a bag; otherwise empty."""
+        """Return a text if the disk is too full for a bag of snapshot mode; otherwise empty."""
         free, reserve = self._free() if self._cache is not None else None, self.options.min_free_mb * _MB
         return low_text(self.path, free, reserve) if free is not None and free < reserve else ""
 
     def _summary(self) -> str:
         topics = f"{len(self._losses)} topics"
         if self._cache is not None:
-            return f"{topics}, the last {self._cache.span_s:.1f} s at hand ({self._cache.bytes / 1e6:.0f} MB)"
+            return f"{topics}, the last {self._cache.span_s:.1f} s in memory ({self._cache.bytes / 1e6:.0f} MB)"
         assert self.bag is not None
         bag = self.bag.status()
         size = f"{bag['bytes'] / 1e6:.1f} MB in {bag['files']} files"
@@ -277,7 +277,7 @@ class Recorder:
 
 
 def _dated(folder: Path, name: str, prefix: str = "") -> Path:
-    """Return an unused path in ``folder``, named by date, time and the characters of ``name`` valid in file names."""
+    """Return an unused path in ``folder``, made of date, time and those characters of ``name`` that a path may have."""
     slug = "".join(c if c.isalnum() else "_" for c in name.strip())[:40].strip("_")
     stem = f"{prefix}{datetime.now():%Y%m%d_%H%M%S}" + (f"_{slug}" if slug else "")
     path, number = folder / stem, 1
@@ -288,5 +288,5 @@ def _dated(folder: Path, name: str, prefix: str = "") -> Path:
 
 
 def _on_disk(path: Path) -> Path:
-    """Return the path, or the nearest one above it that exists."""
+    """Return the path, or its nearest parent that exists."""
     return next(above for above in (path, *path.absolute().parents) if above.exists())

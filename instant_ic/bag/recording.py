@@ -1,8 +1,8 @@
-"""One bag being written by a thread of its own, so that the node never waits for the disk.
+"""Writing of one bag by its own thread, so that the node never waits for the disk.
 
-Messages go into a queue bounded by bytes. The thread writes them, watches the free space of the disk and completes the
-bag. Whatever does not reach the disk is counted by topic: ``overflow`` where the queue was full, ``not_written`` where
-the disk was full or failed.
+Messages enter a queue of limited size in bytes. The thread writes them, watches the disk's free space and completes the
+bag. Lost messages are counted by topic: in ``overflow`` if the queue was full, in ``not_written`` if the disk was full
+or failed.
 """
 
 from __future__ import annotations
@@ -26,19 +26,19 @@ from instant_ic.bag.writer import BagWriter
 from instant_ic.config.ranges import Checked, NotNegative, NotNegativeInt, Positive, PositiveInt, Range
 
 FLUSH_S = 1.0
-"""Longest time of the recording that a killed recorder loses."""
+"""Largest part of the recording, in seconds, that is lost if the recorder is killed."""
 
 SYNC_S = 5.0
-"""Longest time of the recording that a power failure loses, beside what the disk itself holds back."""
+"""Largest part of the recording, in seconds, that a power failure loses, apart from data in the disk's own cache."""
 
 SPACE_S = 1.0
-"""Seconds between two looks at the free space of the disk."""
+"""Seconds between two checks of the disk's free space."""
 
 RECORDING, DISK_FULL, FAILED, ENDING, ENDED = "recording", "disk full", "failed", "ending", "ended"
 
 _MB = 1_000_000
 _KEEP_CUSTOM_S = 10.0
-_ROOM_AGAIN = 64_000_000  # free space above the reserve before recording restarts
+_ROOM_AGAIN = 64_000_000  # free bytes above the reserve before recording restarts
 
 log = logging.getLogger(__name__)
 
@@ -51,12 +51,12 @@ class BagRecorderConfig(Checked):
         compressed: compress with zstd.
         max_bag_size: size in bytes at which the next file begins; 0 writes one file.
         max_bag_duration: length in seconds at which the next file begins; 0 writes one file.
-        queue_mb: largest queue for the disk, MB; messages beyond it are dropped and counted.
-        min_free_mb: stop recording when the disk has less free space, MB.
+        queue_mb: size of the queue in front of the disk, MB; messages that do not fit are dropped and counted.
+        min_free_mb: free space of the disk below which recording stops, MB.
         snapshot: keep the last seconds in memory and write only on request (``ic bag snapshot``, emergency stop).
-            Between the commands ``record`` and ``stop`` (the page's button) it records into a bag of its own.
+            Between the commands ``record`` and ``stop`` (the page's button) a separate bag is recorded.
         snapshot_seconds: seconds before the request that a snapshot holds.
-        max_cache_mb: memory for the last seconds, MB; with more traffic the snapshot is shorter.
+        max_cache_mb: memory for the last seconds, MB; heavy traffic makes the snapshot shorter.
         path: folder of the bag, which must not exist; empty creates ``runs/bag_DATE_TIME`` in the working directory. In
             snapshot mode, the folder for the snapshots.
         topics: names or patterns of the topics to record; empty records everything.
@@ -88,19 +88,19 @@ class BagRecorderConfig(Checked):
 
 
 class Recording:
-    """A bag that is being written. Only the node's thread calls it.
+    """A bag that is being written. Only the node's thread may call its methods.
 
     Args:
         path: folder of the bag, which must not exist.
         custom: returns the values to store with the bag, by name.
-        content: messages of the past, oldest first, with which the bag begins; its thread then creates the bag, and
-            :attr:`error` says if that fails.
-        until_s: time at which the bag ends, by the monotonic clock; see :meth:`tick`.
-        free_bytes: free space on the disk of a folder; replaced in tests.
+        content: past messages with which the bag begins, oldest first. If there are any, the thread creates the bag and
+            :attr:`error` reports a failure.
+        until_s: time at which :meth:`tick` ends the bag, by the monotonic clock.
+        free_bytes: returns the free space on the disk of a folder; replaced in tests.
 
     Attributes:
-        overflow: messages by topic that found no place in the queue.
-        failed: whether an error occurred since the start.
+        overflow: messages by topic that did not fit into the queue.
+        failed: True if an error has occurred since the start.
 
     Raises:
         BagError: the bag cannot be created.
@@ -132,7 +132,7 @@ class Recording:
         self._error = ""
         self._skipped: Counter[str] = Counter()  # replaced, never changed: another thread reads it
         self._queue = deque(content)
-        self._pending = len(content)  # queued, or in the hands of the thread
+        self._pending = len(content)  # queued, or being written
         self._pending_bytes = sum(len(message.payload) for message in content)
         self._max_bytes = options.queue_mb * _MB + self._pending_bytes
         self._changed = threading.Condition()
@@ -143,7 +143,7 @@ class Recording:
 
     @property
     def state(self) -> str:
-        """``recording``, ``disk full``, ``failed``, ``ending`` or ``ended``."""
+        """The bag's state: ``recording``, ``disk full``, ``failed``, ``ending`` or ``ended``."""
         return ENDING if self._ended_s and not self.done else self._state
 
     @property
@@ -153,24 +153,24 @@ class Recording:
 
     @property
     def not_written(self) -> Counter[str]:
-        """Messages by topic that were lost because the disk was full, or failed."""
+        """Messages by topic that were lost because the disk was full or failed."""
         return self._skipped + self._writer.lost
 
     @property
     def error(self) -> str:
-        """Why recording failed or waits, and what was lost by that; empty when all is well."""
+        """Reason why recording failed or waits, with the lost messages; empty while recording works."""
         gone = self.not_written if self._error else None
         return f"{self._error}; not recorded: {counts_text(gone)}" if gone else self._error
 
     def put(self, message: BagMessage, old: bool = False) -> None:
-        """Queue a message; never waits.
+        """Queue a message without waiting.
 
-        Latched values may be minutes old when a bag begins: they are held until the first other message, or the second
-        one of a publisher, and get its stamp.
+        Latched values may be minutes old when a bag begins. They are held until another message arrives, or a second
+        value from the same publisher, and then get its stamp.
 
         Args:
             message: the message.
-            old: it is a latched value from before the bag.
+            old: the message is a latched value from before the bag.
         """
         if self._ended_s:
             return
@@ -183,15 +183,15 @@ class Recording:
         self._enqueue(message)
 
     def tick(self) -> None:
-        """End the bag when its time has come."""
+        """End the bag if ``until_s`` has passed."""
         if time.monotonic() >= self._until_s:
             self.finish()
 
     def finish(self, report: bool = True) -> None:
-        """Stop taking messages; the thread writes what is queued, and completes the bag.
+        """Accept no more messages. The thread writes the queue and completes the bag.
 
         Args:
-            report: report the end in the log.
+            report: log the end.
         """
         if self._ended_s:
             return
@@ -203,7 +203,7 @@ class Recording:
             self._changed.notify()
 
     def close(self, timeout_s: float = 30.0) -> None:
-        """Complete the bag and wait for it.
+        """Complete the bag, and wait until it is complete.
 
         Raises:
             BagError: the bag could not be written completely.
@@ -213,7 +213,7 @@ class Recording:
         if not self.done:
             raise BagError(
                 f"bag {self.path}: the disk did not take the last {self._pending} messages "
-                f"({self._pending_bytes / 1e6:.1f} MB) within {timeout_s:g} s; ic bag recover {self.path}"
+                f"({self._pending_bytes / 1e6:.1f} MB) within {timeout_s:g} s; run ic bag recover {self.path}"
             )
         if self._state == FAILED:
             raise BagError(self.error)
@@ -240,7 +240,7 @@ class Recording:
             self._enqueue(message)
 
     def _enqueue(self, message: BagMessage) -> None:
-        """Queue a message, or count it if it does not fit; latched messages always fit."""
+        """Queue a message, or count it as overflow if the queue is full. Latched messages are always queued."""
         if message.qos.latched:
             message = replace(message, stamp_ns=max(message.stamp_ns, self._begun_ns))
         size = len(message.payload)
@@ -270,7 +270,7 @@ class Recording:
             with self._noting_failures():
                 self._work(due_s)
             if message is not None:
-                with self._noting_failures():  # also after a failure above: it counts the message
+                with self._noting_failures():  # even after a failure above, because the message must be counted
                     self._write(message)
                 with self._changed:
                     self._pending -= 1
@@ -301,7 +301,7 @@ class Recording:
         )
 
     def _work(self, due_s: dict[str, float]) -> None:
-        """Run the periodic work that is due.
+        """Do the periodic work that is due.
 
         Raises:
             BagError: the disk is full, or failed.
@@ -324,7 +324,7 @@ class Recording:
             self._writer.sync()
 
     def _look_for_space(self) -> None:
-        """End the file when the disk has less space than the reserve; go on once it has more again.
+        """End the file when the disk has less free space than the reserve; continue when there is space again.
 
         Raises:
             BagError: the folder was removed, or the file cannot be completed.
@@ -334,7 +334,7 @@ class Recording:
         try:
             free = self._free_bytes(self.path)
         except OSError as error:
-            raise BagError(f"bag {self.path}: {error.strerror}: its folder was removed") from None
+            raise BagError(f"bag {self.path}: {error.strerror}; its folder was removed") from None
         if self._state == RECORDING and free < self._reserve:
             self._set_custom()
             self._writer.end_file()
@@ -353,7 +353,7 @@ class Recording:
             self._writer.set_custom(f"instant_ic.{key}", json.dumps(value, sort_keys=True))
 
     def _complete(self) -> None:
-        for step in (self._writer.end_file, self._writer.close):  # the second writes what the first has lost
+        for step in (self._writer.end_file, self._writer.close):  # the second step stores the losses of the first
             self._set_custom()
             try:
                 step()
@@ -369,8 +369,8 @@ class Recording:
 
 
 def low_text(path: Path, free: int, reserve: int) -> str:
-    """Return that a disk has less free space than the reserve."""
-    return f"only {free / 1e6:.0f} MB are free for {path}, {reserve / 1e6:.0f} MB are the reserve: not recording"
+    """Return the text for a disk that has less free space than the reserve."""
+    return f"only {free / 1e6:.0f} MB are free for {path} (reserve: {reserve / 1e6:.0f} MB): not recording"
 
 
 def counts_text(counts: Mapping[str, int]) -> str:

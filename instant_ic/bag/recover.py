@@ -1,4 +1,4 @@
-"""Recovers truncated bags (power loss, full disk, killed recorder)."""
+"""Recovery of truncated bags, as left by a power loss, a full disk or a killed recorder."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ class Recovered:
     """Result of a recovery.
 
     Attributes:
-        stopped_by: reason why reading stopped early; empty when every file was complete.
+        stopped_by: reason why reading stopped early; empty if every file was complete.
         damaged: descriptions of skipped chunks.
-        skipped: topic → why its messages were skipped: they are not CDR.
+        skipped: topic → encoding of its messages, which were skipped because they are not CDR.
     """
 
     count: int
@@ -30,14 +30,14 @@ class Recovered:
 
 
 def recover(source: Path, target: Path) -> Recovered:
-    """Copy every readable message into a new bag: all complete chunks, and the complete messages of a truncated chunk.
+    """Copy every readable message into a new bag, including the complete messages of a truncated chunk.
 
     Args:
         source: bag folder or ``.mcap`` file.
         target: folder of the new bag, which must not exist.
 
     Raises:
-        BagError: nothing can be read, or the target cannot be written.
+        BagError: no message can be read, or the target cannot be written.
     """
     files = mcap_files(source)
     stopped_by: list[str] = []
@@ -45,7 +45,7 @@ def recover(source: Path, target: Path) -> Recovered:
     skipped: dict[str, str] = {}
     repetitions = Repetitions()
     count = 0
-    # Sorted only within chunks, and chunks of a recorder may overlap slightly: readers sort by the new index.
+    # Messages are sorted within chunks, but a recorder's chunks may overlap slightly. Readers sort by the new index.
     with BagWriter(target) as writer:
         for number, file in enumerate(files):
             scan = McapScan(file)
@@ -58,7 +58,7 @@ def recover(source: Path, target: Path) -> Recovered:
                     repetitions.starts_ns.add(found.stamp_ns)
                 qos = preset_of_text(channel.metadata.get("offered_qos_profiles", ""))
                 message = BagMessage(channel.topic, schema.name, found.payload, found.stamp_ns, qos)
-                if not repetitions.repeats(message):  # the writer adds its own repetitions
+                if not repetitions.repeats(message):  # the writer repeats latched values itself
                     writer.write(message.topic, message.type_name, message.payload, message.stamp_ns, qos, schema)
                     count += 1
             for key, value in scan.metadata.get(CUSTOM_RECORD, {}).items():
@@ -81,7 +81,7 @@ def mcap_files(source: Path) -> list[Path]:
     """Return the MCAP files of a bag in numeric order, or the file itself.
 
     Raises:
-        BagError: there is none.
+        BagError: there is no MCAP file.
     """
     files = sorted(source.glob("*.mcap"), key=_number) if source.is_dir() else [source]
     if not files or not files[0].is_file():

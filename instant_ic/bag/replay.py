@@ -1,4 +1,4 @@
-"""Lockstep replay: runs a bag through real nodes in one process; every run gives the same result, bit for bit."""
+"""Lockstep replay of a bag through real nodes in one process. Every run gives the same result, bit for bit."""
 
 from __future__ import annotations
 
@@ -31,10 +31,10 @@ BROADCASTS: Mapping[str, tuple[str, ...]] = {
     "theta_camera": ("camera",),
     "vlp16_driver": ("velodyne",),
 }
-"""Child frames that the shipped nodes broadcast: transforms with these frames in the bag are not fed to a replay.
+"""Child frames that the shipped nodes broadcast. A replay drops these frames from the bag.
 
-Frames that a node broadcasts only temporarily for another node (SLAM without wheel odometry) are not listed and stay
-with that other node. For nodes not listed, every frame is dropped from its first broadcast on.
+A frame that a node broadcasts only in place of another node (SLAM without wheel odometry) is not listed. For nodes that
+are not listed, a frame is dropped as soon as the node has broadcast it.
 """
 
 
@@ -56,7 +56,7 @@ class ReplayResult:
     """Result of a replay.
 
     Attributes:
-        fed: messages of the bag passed to nodes, by topic.
+        fed: messages of the bag that were passed to nodes, by topic.
         left_out: messages of the bag that were not passed because a replayed node publishes them.
         made: messages that the nodes published, by topic.
         bag_s: duration of the bag.
@@ -80,12 +80,12 @@ def shipped_parameter_files(name: str) -> list[Path]:
         return []
     found = []
     for file in sorted(folder.glob("*.yaml")):
-        if file.name in ("sim.yaml", "fleet_sim.yaml"):  # fleet_sim.yaml lowers rates to fit many robots
+        if file.name in ("sim.yaml", "fleet_sim.yaml"):  # fleet_sim.yaml lowers rates for many robots on one machine
             continue
         try:
             named = {name, SHARED} & _sections(file, file.stat().st_mtime_ns)
         except (OSError, yaml.YAMLError):
-            continue  # a broken file that this node may not use: an error appears when it is named explicitly
+            continue  # this node may not use the broken file; naming the file explicitly reports the error
         if named:
             found.append(file)
     return found
@@ -93,7 +93,7 @@ def shipped_parameter_files(name: str) -> list[Path]:
 
 @functools.lru_cache(maxsize=64)
 def _sections(file: Path, changed_ns: int) -> frozenset[str]:
-    """Return the nodes that a parameter file configures. Cached by time of change: parsing is slow."""
+    """Return the nodes that a parameter file configures. Cached by modification time, because parsing is slow."""
     content = read_yaml(file.read_text())
     return frozenset(content) if isinstance(content, dict) else frozenset()
 
@@ -104,10 +104,10 @@ def make_node(name: str, params_files: Sequence[Path] | None, overrides: Sequenc
     Args:
         name: name of the node.
         params_files: parameter files; None takes those of ``config/`` for the node.
-        overrides: ``node.key:=value`` arguments; those of other nodes are skipped.
+        overrides: ``node.key:=value`` arguments; those for other nodes are skipped.
 
     Raises:
-        NodeFileError: there is no such node.
+        NodeFileError: no node has this name.
         ParameterError: a parameter is wrong.
     """
     files = shipped_parameter_files(name) if params_files is None else list(params_files)
@@ -127,8 +127,8 @@ def replay(
 ) -> ReplayResult:
     """Feed a bag to nodes message by message and record what they publish.
 
-    The clock is the bag's and stands still while a node works, so the result does not depend on the machine's speed.
-    Topics that a replayed node publishes are not fed, nor are transforms whose child frame a replayed node broadcasts.
+    The clock follows the bag and stands still while a node works, so the result does not depend on the machine's speed.
+    Topics and transforms that a replayed node publishes itself are not fed.
 
     Args:
         bag: bag to feed.
@@ -183,7 +183,7 @@ def _check_types(reader: BagReader, bus: LockstepBus) -> None:
 def _feed(
     message: BagMessage, bus: LockstepBus, running: Sequence[Node[Any]], made_frames: set[str], result: ReplayResult
 ) -> None:
-    """Publish a message of the bag, or only advance the clock where a replayed node publishes it."""
+    """Publish a message of the bag, or only advance the clock if a replayed node publishes that topic itself."""
     payload: bytes | None = message.payload
     if message.topic in TRANSFORM_TOPICS:
         payload = without_children(message, made_frames)

@@ -10,11 +10,11 @@ from instant_ic.bag.message import BagMessage
 
 
 class SnapshotCache:
-    """Keeps the latest messages in memory; not thread-safe.
+    """The latest messages in memory; not thread-safe.
 
     Args:
-        seconds: how long to keep a message, by the clock passed to :meth:`add`.
-        max_bytes: total size above which the oldest messages are dropped earlier.
+        seconds: time to keep a message, by the clock passed to :meth:`add`.
+        max_bytes: total size above which the oldest messages are dropped early.
     """
 
     def __init__(self, seconds: float, max_bytes: int) -> None:
@@ -25,7 +25,7 @@ class SnapshotCache:
         self._before = LatchedValues()
 
     def add(self, entry: BagMessage, now_s: float) -> None:
-        """Add a message received at ``now_s``; drop expired ones."""
+        """Add a message received at ``now_s``, and drop expired messages."""
         self._entries.append((now_s, entry))
         self.bytes += len(entry.payload)
         while self._entries and (self._entries[0][0] < now_s - self.seconds or self.bytes > self.max_bytes):
@@ -47,9 +47,9 @@ class SnapshotCache:
         return values.values()
 
     def content(self) -> list[BagMessage]:
-        """Return the messages, oldest first, preceded by the latched values valid at their start.
+        """Return the messages, oldest first, preceded by the latched values that were valid at their start.
 
-        No latched value has a stamp before that of the first other message.
+        A latched value that is older than the first other message gets that message's stamp.
         """
         entries = [entry for _, entry in self._entries]
         stamps_ns = [entry.stamp_ns for entry in entries if not entry.qos.latched] or [e.stamp_ns for e in entries]

@@ -1,4 +1,4 @@
-"""Removes transforms from ``/tf`` messages when a running node broadcasts them."""
+"""Removal of transforms that a running node broadcasts from recorded ``/tf`` messages."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Messages recorded with an older definition of a type, as messages of the present one."""
+"""Conversion of messages recorded with an older definition of their type."""
 
 from __future__ import annotations
 
@@ -16,11 +16,10 @@ _INTEGERS = tuple(f"{sign}int{bits}" for sign in ("", "u") for bits in (8, 16, 3
 
 @functools.lru_cache(maxsize=200)
 def upgrade_of(schema: Schema) -> Callable[[bytes], bytes] | None:
-    """Return a function that converts payloads of ``schema`` to the present definition; None where that cannot be done.
+    """Return a function that converts payloads of ``schema`` to the present definition; None if that is impossible.
 
-    A type may have grown by fields of plain numbers, booleans and strings at its end; they get 0, False or "". It may
-    have lost fields at its end.
-    Any other difference could change the meaning of a field.
+    Numbers, booleans and strings may have been added at the end of the type; they get 0, False or "". Fields may also
+    have been removed at its end. Any other difference could change the meaning of a field, so it is not converted.
     """
     own = schema_or_unknown(schema.name)
     if not own.encoding or schema.encoding != "ros2msg" or schema.type_hash in ("", own.type_hash):

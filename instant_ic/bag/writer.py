@@ -1,4 +1,4 @@
-"""Writes rosbag2 folders of one or more MCAP files; each file is self-contained and starts with the latched values."""
+"""Writing of rosbag2 folders with one or more MCAP files, each of which begins with the latched values."""
 
 from __future__ import annotations
 
@@ -34,22 +34,22 @@ CUSTOM_RECORD = "instant_ic"
 
 
 class BagWriter(Closing):
-    """Writes a bag folder; a context manager; not thread-safe.
+    """Writer of a bag folder; a context manager; not thread-safe.
 
-    Each completed file is listed in ``metadata.yaml`` immediately. A killed recorder leaves a bag that opens, and
-    one file to recover.
+    Each completed file is listed in ``metadata.yaml`` immediately. A killed recorder leaves a readable bag and one file
+    to recover.
 
     Args:
         path: the folder, which must not exist; only its owner can read it.
         compressed: compress chunks with zstd, for archiving or sending; halves the size of point packets.
         max_bytes: file size at which a new file starts; 0 sets no limit.
         max_duration_s: duration by message stamps after which a new file starts; 0 sets no limit.
-        create: call :meth:`create` at once; otherwise it must be called before anything else.
+        create: call :meth:`create` at once; otherwise the caller must call it before any other method.
 
     Raises:
-        DiskFullError: in all methods: the disk is full; lost messages are in ``lost``. The current file is given up at
-            its last complete chunk. The bag can be closed, or continued in another file once there is room.
-        BagError: in all methods: the disk failed; here also: the folder exists, or cannot be created.
+        DiskFullError: in all methods: the disk is full. ``lost`` counts the lost messages, and the current file ends
+            with its last complete chunk. The bag can be closed, or continued in another file once there is space.
+        BagError: in all methods: the disk failed. Here also: the folder exists or cannot be created.
     """
 
     def __init__(
@@ -66,13 +66,13 @@ class BagWriter(Closing):
         self.max_duration_ns = int(max_duration_s * 1e9)
         self.bytes = 0
         self.lost: Counter[str] = Counter()
-        """Messages by topic that were given to :meth:`write` and did not reach the disk; replaced, never changed."""
+        """Messages by topic that :meth:`write` accepted but that did not reach the disk; replaced, never changed."""
         self._topics: Topics = {}
         self._latched = LatchedValues()
         self._custom: dict[str, str] = {}
         self._done: list[McapWriter] = []
         self._file: McapWriter | None = None
-        self._opened = 0  # files, also those that were given up
+        self._opened = 0  # number of files, including abandoned ones
         self._closed = False
         if create:
             self.create()
@@ -89,7 +89,7 @@ class BagWriter(Closing):
 
     @property
     def count(self) -> int:
-        """Messages so far, with the latched values that later files repeat."""
+        """Number of messages so far, including latched values repeated in later files."""
         written = sum(file.counts.total() for file in self._done)
         return written + (self._file.given.total() if self._file is not None else 0)
 
@@ -116,8 +116,8 @@ class BagWriter(Closing):
             payload: CDR bytes; copied.
             stamp_ns: nanoseconds since the epoch.
             qos: QoS of the topic; used the first time that the topic appears.
-            schema: definition of the type; default ours. Without one, the bytes are still recorded.
-            publisher: name of the publisher; each publisher of a latched topic has its own current value.
+            schema: definition of the type; default ours. If it is unknown, the bytes are still recorded.
+            publisher: name of the publisher. Each publisher of a latched topic has its own current value.
         """
         if self._closed:
             raise BagError(f"bag {self.path} is closed")
@@ -136,12 +136,12 @@ class BagWriter(Closing):
         self.bytes += len(payload)
 
     def remember(self, message: BagMessage) -> None:
-        """Let the next file begin with a latched message that was not written."""
+        """Store a latched message for the start of the next file without writing it now."""
         self._add((message.topic, message.type_name), message.qos)
         self._latched.put(message)
 
     def add_topic(self, topic: str, type_name: str, qos: QoS) -> None:
-        """Add a topic that may never carry a message."""
+        """Add a topic, which the bag then lists even if it has no messages."""
         self._add((topic, type_name), qos)
         if self._file is not None:
             with self._giving_up(topic):
@@ -151,31 +151,31 @@ class BagWriter(Closing):
         self._custom[key] = value
 
     def keep_custom(self) -> None:
-        """Write the current ``custom_data`` into the file itself, for a recovery to read."""
+        """Write the current ``custom_data`` into the file itself, so that a recovery can read it."""
         if self._file is not None and self._file.given:
             with self._giving_up("metadata"):
                 self._file.add_metadata(CUSTOM_RECORD, self._custom)
 
     def flush(self) -> None:
-        """Pass all messages so far to the operating system. They then survive the end of this process."""
+        """Pass all messages so far to the operating system, so that they survive the end of this process."""
         if self._file is not None:
             with self._giving_up("flush"):
                 self._file.flush()
 
     def sync(self) -> None:
-        """Write all flushed messages to the disk itself. They then survive a power failure."""
+        """Write all flushed messages to the disk itself, so that they survive a power failure."""
         if self._file is not None:
             with self._giving_up("sync"):
                 self._file.sync()
                 sync_folder(self.path)
 
     def end_file(self) -> None:
-        """Complete the current file and list it in ``metadata.yaml``; the next message starts another."""
+        """Complete the current file and list it in ``metadata.yaml``. The next message starts another file."""
         try:
             if self._file is not None:
                 self._finish_file(self._file)
         except BagError:
-            with suppress(BagError):  # the first error says more
+            with suppress(BagError):  # the first error is more useful
                 self._write_metadata()
             raise
         self._write_metadata()
@@ -189,7 +189,7 @@ class BagWriter(Closing):
     # -- internals -------------------------------------------------------------------------------
 
     def _add(self, topic: Topic, qos: QoS, schema: Schema | None = None) -> QoS:
-        """Note QoS and type of a topic at its first message; return its QoS."""
+        """Store QoS and type of a topic at its first message, and return its QoS."""
         if topic not in self._topics:
             schema = schema or schema_or_unknown(topic[1])
             if not schema.encoding:
@@ -198,7 +198,7 @@ class BagWriter(Closing):
         return self._topics[topic][0]
 
     def _file_for(self, stamp_ns: int) -> McapWriter:
-        """Return the file for a message; start the next one, with the latched values, if necessary."""
+        """Return the file for a message. If the current file is full, start the next with the latched values."""
         if self._file is not None and self._is_full(self._file, stamp_ns):
             self.end_file()
         if self._file is None:
@@ -215,7 +215,7 @@ class BagWriter(Closing):
             return False
         if self.max_bytes and file.size >= self.max_bytes:
             return True
-        # A step of the clock ends a file in either direction.
+        # A clock step in either direction ends a file.
         return 0 < self.max_duration_ns <= abs(stamp_ns - file.first_ns)
 
     def _open_file(self) -> McapWriter:
@@ -243,7 +243,7 @@ class BagWriter(Closing):
 
     @contextmanager
     def _giving_up(self, what: str) -> Iterator[None]:
-        """After an error of the disk, count what the current file has lost, and leave it."""
+        """Abandon the current file after a disk error, and count its lost messages."""
         try:
             yield
         except OSError as error:
@@ -257,7 +257,7 @@ class BagWriter(Closing):
         try:
             write_metadata(self.path, self._done, self._topics, self._custom)
         except OSError as error:
-            hint = f"; make room, then ic bag recover {self.path}" if error.errno in _FULL else ""
+            hint = f"; free some space, then run ic bag recover {self.path}" if error.errno in _FULL else ""
             raise BagError(f"bag {self.path}: metadata.yaml cannot be written: {error.strerror}{hint}") from error
 
 

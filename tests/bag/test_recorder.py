@@ -124,7 +124,7 @@ def test_a_disk_that_hangs_for_good_does_not_hang_the_end(tmp_path: Path, monkey
     disk.hang()
     recorder.take("/scan", BOOL, b"x" * 2_000_000, 1 * S)
     recorder.take("/estop", BOOL, YES, 2 * S)
-    with pytest.raises(BagError, match=r"did not take the last 2 messages \(2\.0 MB\) within 0\.3 s; ic bag recover"):
+    with pytest.raises(BagError, match=r"did not take the last 2 messages \(2\.0 MB\) within 0\.3 s; run"):
         recorder.close(timeout_s=0.3)
     disk.go.set()  # lets the thread go
 
