@@ -1,4 +1,4 @@
-"""Runs a node's callbacks one after another; one that raises does not end the node."""
+"""Execution of a node's callbacks, one after another. A callback that raises does not end the node."""
 
 from __future__ import annotations
 
@@ -12,19 +12,19 @@ from instant_ic.bus.flow_report import RECENT_S
 
 
 class NodeError(RuntimeError):
-    """A fault that its message fully explains. Raised in ``setup``, it ends the process without a traceback."""
+    """A fault that its message explains in full. Raised in ``setup``, it ends the process without a traceback."""
 
 
 class Callbacks:
     """Callbacks of one node.
 
     Args:
-        diagnostics: reports the exceptions.
-        wake: ends the node's wait for messages.
-        lockstep: an exception is raised again after it has been reported.
+        diagnostics: takes the diagnoses of exceptions.
+        wake: function that ends the node's wait for messages.
+        lockstep: raise an exception again after it has been reported.
 
     Attributes:
-        soon: functions of :meth:`call_soon` that wait, with their arguments.
+        soon: functions passed to :meth:`call_soon` that have not run yet, with their arguments.
     """
 
     def __init__(self, diagnostics: Diagnostics, wake: Callable[[], None], lockstep: bool) -> None:
@@ -48,12 +48,14 @@ class Callbacks:
             function, args = self.soon.popleft()
             label = getattr(function, "__qualname__", "callback")
             self.run(label, function, *args)
-            self._failed_at.pop(label, None)  # called once: that another call succeeds mends nothing
+            self._failed_at.pop(
+                label, None
+            )  # a function runs once, so a later success of another one must not clear the diagnosis
             ran = True
         return ran
 
     def run(self, what: str, function: Callable[..., None], *args: Any) -> None:
-        """Run a function; an exception becomes the diagnosis ``what``, until it has been fine for a while."""
+        """Run a function. An exception becomes the diagnosis ``what``, which clears after some time without one."""
         self._running = (what, started_s := time.monotonic())
         try:
             function(*args)
@@ -70,7 +72,7 @@ class Callbacks:
             self._running = None
 
     def run_setup(self, setup: Callable[[], None]) -> None:
-        """Run a node's ``setup``; its exceptions are raised."""
+        """Run a node's ``setup`` and pass its exceptions on."""
         self._running = ("setup", time.monotonic())
         setup()
         self._running = None

@@ -1,7 +1,7 @@
-"""Clocks: a node reads the time from its clock, never from the system.
+"""Clocks. A node reads the time from its clock, never from the system.
 
-There are two kinds of time. ``now_ns`` is for stamps, which other processes and machines compare with their own; it
-jumps when somebody sets the machine's clock. ``steady_ns`` is for durations, timers and time-outs; it never jumps.
+There are two kinds of time. ``now_ns`` is for stamps, which other processes and machines compare with their own time.
+It jumps when the machine's clock is set. ``steady_ns`` is for durations, timers and time-outs. It never jumps.
 """
 
 from __future__ import annotations
@@ -24,16 +24,16 @@ class Clock(Protocol):
         ...
 
     def suspended_ns(self) -> int:
-        """Nanoseconds for which the machine was suspended since it started; the steady clock stood still then."""
+        """Nanoseconds for which the machine has been suspended since it started. The steady clock then stood still."""
         ...
 
 
 class SystemClock:
-    """The machine's clock, at this process's pace (:mod:`instant_ic.util.pace`), which :func:`pace.use` sets before.
+    """The machine's clock at this process's pace. Set the pace (:func:`instant_ic.util.pace.use`) before creating it.
 
     Attributes:
         now_ns: returns nanoseconds since the epoch.
-        steady_ns: returns nanoseconds of a clock that never jumps, even when somebody sets the machine's clock.
+        steady_ns: returns nanoseconds of a clock that does not jump when the machine's clock is set.
         suspended_ns: :func:`instant_ic.util.pace.suspended_ns`.
     """
 
@@ -45,7 +45,7 @@ class SystemClock:
 
 
 class ManualClock:
-    """A clock that is set from outside: by ``/clock`` in replay, by the lockstep bus in tests."""
+    """A clock that others set: ``/clock`` in replay, the lockstep bus in tests."""
 
     def __init__(self, start_ns: int = 0) -> None:
         self._now_ns = start_ns
@@ -56,17 +56,17 @@ class ManualClock:
         return self._now_ns
 
     def steady_ns(self) -> int:
-        """Return the same value as ``now_ns``: time-outs also run in simulated time."""
+        """Return the same value as ``now_ns``, so that time-outs run in simulated time."""
         return self._now_ns
 
     def suspended_ns(self) -> int:
-        """Return the sum of all :meth:`suspend`."""
+        """Return the total time passed to :meth:`suspend`."""
         return self._suspended_ns
 
     def suspend(self, seconds: float) -> None:
-        """Let the machine have been suspended for a time."""
+        """Simulate that the machine was suspended for a time."""
         self._suspended_ns += round(seconds * 1e9)
 
     def set(self, now_ns: int) -> None:
-        """Set the time. It may go back, for example when a player loops."""
+        """Set the time. It may go back, for example when a player starts a bag again."""
         self._now_ns = int(now_ns)

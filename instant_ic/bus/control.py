@@ -2,9 +2,9 @@
 
 Each node process listens on ``RUN_DIR/nodes/<node>.sock`` (a Unix socket in a folder of mode 0700). A request is one
 line of JSON, ``{"op": "set", "values": {"rate_hz": "5.0"}}`` with values as YAML text. The answer is one line too:
-``{"ok": true, ...}`` or ``{"ok": false, "error": "what is wrong", "kind": "parameter"}``. Separate threads answer, even
-while the node's own thread is in a long callback. Only a change has to wait for the node's thread; it is dropped if it
-waits too long.
+``{"ok": true, ...}`` or ``{"ok": false, "error": "what is wrong", "kind": "parameter"}``. Threads of the server answer,
+even while the node's own thread is in a long callback. Only a change waits for the node's thread. It is dropped if it
+has waited too long.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ log = logging.getLogger(__name__)
 
 
 class ControlError(RuntimeError):
-    """The node is not running, does not answer, or refuses the request."""
+    """The node is not running, does not answer or refuses the request."""
 
 
 class NodeMissingError(ControlError):
@@ -63,10 +63,10 @@ class ControlServer:
 
     Args:
         node: the node.
-        path: path of the socket; an existing file is replaced, since the caller holds the node's claim.
+        path: path of the socket. An existing file is replaced, because the caller holds the node's claim.
 
     Raises:
-        RegistryError: the path is too long for a socket, or cannot be bound.
+        RegistryError: the path is too long for a socket or cannot be bound.
     """
 
     def __init__(self, node: Node[Any], path: Path) -> None:
@@ -134,7 +134,7 @@ class ControlServer:
             return _refusal(str(error), "parameter")
         except NodeBusyError as error:
             return _refusal(str(error), "busy")
-        except Exception as error:  # report a bug here to the client; it must not end the node
+        except Exception as error:  # a bug in an operation is reported to the client and must not end the node
             log.exception("control")
             return _refusal(f"{type(error).__name__}: {error}", "internal")
 
@@ -188,8 +188,8 @@ class ControlServer:
         """Run a function on the node's thread and return its result.
 
         Raises:
-            NodeBusyError: the node's thread was busy for too long; the function will not run later.
-            _RequestError: the function has started, but has not finished in time; its effect may follow.
+            NodeBusyError: the node's thread was busy for too long. The function has not run and will not run.
+            _RequestError: the function has started but not finished in time. It may still take effect.
         """
         future: concurrent.futures.Future[Any] = concurrent.futures.Future()
 
@@ -205,13 +205,13 @@ class ControlServer:
         try:
             return future.result(_CHANGE_S)
         except concurrent.futures.TimeoutError:
-            if not future.cancel():  # it has just started
+            if not future.cancel():  # the function has just started
                 try:
                     return future.result(_CHANGE_S)
                 except concurrent.futures.TimeoutError:
                     raise _RequestError(
                         f"{self._node.node_name} has started the change but not finished it within {_CHANGE_S:g} s; "
-                        "it may still take effect: look before you repeat it"
+                        "it may still take effect: check the value before you repeat it"
                     ) from None
             what, busy_s = self._node.callbacks.activity()
             doing = f"{what} has been running for {busy_s:.1f} s" if what else "its loop is not running"
@@ -227,7 +227,7 @@ class NodeControl:
         timeout_s: time to wait for each answer.
 
     Raises:
-        ControlError: by each method, where the node is not running, does not answer or refuses.
+        ControlError: raised by each method if the node is not running, does not answer or refuses the request.
     """
 
     def __init__(self, run_dir: Path, node: str, timeout_s: float = 5.0) -> None:
@@ -236,7 +236,7 @@ class NodeControl:
         self.timeout_s = timeout_s
 
     def describe(self) -> list[ParameterInfo]:
-        """Every parameter of the node."""
+        """Return a description of every parameter of the node."""
         return [ParameterInfo(**entry) for entry in self.request({"op": "describe"})["parameters"]]
 
     def get(self) -> dict[str, Any]:
@@ -244,13 +244,13 @@ class NodeControl:
         return {info.name: info.value for info in self.describe()}
 
     def set(self, values: Mapping[str, Any]) -> dict[str, Any]:
-        """Change several parameters together, or none; returns those whose value has changed.
+        """Change several parameters together, or none. Return those whose value has changed.
 
         Args:
-            values: plain values, or with the spelling of their scalars.
+            values: key to value; a plain value, or one with the spelling of its scalars (``yaml_text.spelled``).
 
         Raises:
-            ParameterError: a value is refused; the message says why.
+            ParameterError: a value is refused for the reason in the message.
             NodeBusyError: the node's thread is busy.
         """
         texts = {key: one_line(value) for key, value in values.items()}
@@ -258,7 +258,7 @@ class NodeControl:
         return changed
 
     def log_level(self, level: str | None = None) -> str:
-        """Set the node's log level if ``level`` is given; return its level."""
+        """Set the node's log level if ``level`` is given. Return the present level."""
         return str(self.request({"op": "log_level", "level": level})["level"])
 
     def status(self) -> dict[str, Any]:
@@ -273,7 +273,8 @@ class NodeControl:
         """Send one request and return the answer.
 
         Raises:
-            ParameterError, ControlError: why the node refused, or why there is no answer.
+            ParameterError: the node refused a value.
+            ControlError: the node refused the request, or there is no answer.
         """
         path = self.run_dir / "nodes" / f"{self.node}.sock"
         with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as connection:
@@ -310,7 +311,7 @@ class NodeControl:
 
 
 def _read_line(reader: BinaryIO, max_bytes: int) -> bytes:
-    """Return the next line; empty when the other side has closed."""
+    """Return the next line. Empty if the other side has closed the connection."""
     line = reader.readline(max_bytes + 1)
     if len(line) > max_bytes:
         raise _RequestError(f"line longer than {max_bytes} bytes")

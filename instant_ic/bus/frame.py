@@ -1,4 +1,4 @@
-"""Wire format of a topic (docs/wire.md): a message is two ZeroMQ parts, namely topic with header, and body."""
+"""Wire format of a topic (docs/wire.md). A message has two ZeroMQ parts: topic and header, and body."""
 
 from __future__ import annotations
 
@@ -11,26 +11,26 @@ VERSION = 4
 MAGIC = b"IIC\0"
 
 HEADER = struct.Struct("<BQQq8s8sQ")
-"""Kind (:data:`INLINE` or :data:`SHARED`), mark, sequence, publication time in ns, publisher, type, size of the CDR."""
+"""Kind (:data:`INLINE` or :data:`SHARED`), mark, sequence, publication time in ns, publisher, type, CDR bytes."""
 
 MARK = int.from_bytes(MAGIC + bytes([VERSION, 0, 0, 0]), "little")
-"""Magic and version in one number."""
+"""Magic number and version as one integer."""
 
 INLINE, SHARED = 0, 1
 """Kinds: the body is the CDR itself, or a :data:`REFERENCE` to it."""
 
 REFERENCE = struct.Struct("<IIII")
-"""Place of a message: process and descriptor of its slot, number of the slot, smallest number still in use."""
+"""Place of a message: process and file descriptor of its slot, slot number, smallest slot number still in use."""
 
 KEY_COPY = b"="
-"""Prefix of the name in the inline copy of a referenced message; readers of the name do not get it."""
+"""Prefix of the topic's name in an inline copy of a shared message. Subscribers of the plain name do not get it."""
 
 MOST_BYTES = 0xFFFFFFFF
 """Largest message, in bytes."""
 
 
 class FrameError(ValueError):
-    """The parts are not a message of this version."""
+    """The received parts are not a message of this version."""
 
 
 Header = tuple[int, int, int, int, bytes, bytes, int]
@@ -38,10 +38,10 @@ Header = tuple[int, int, int, int, bytes, bytes, int]
 
 
 def unpack_header(part: bytes) -> Header:
-    """Check and parse the header, with which the first part of a message ends.
+    """Check and parse the header at the end of a message's first part.
 
     Raises:
-        FrameError: there is no header of this version.
+        FrameError: the part does not end with a header of this version.
     """
     at = len(part) - HEADER.size
     if at >= 0:

@@ -1,4 +1,4 @@
-"""The heartbeat of a node (NodeStatus), as the launcher and the commands read it."""
+"""The heartbeat of a node (NodeStatus), for the launcher and the commands."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from typing import Any
 TYPE = "instant_ic_msgs/msg/NodeStatus"
 STATES = ("starting", "running", "degraded", "failed", "stopping")
 SILENT_AFTER_S = 3.0
-"""A node without a heartbeat for longer than this is stale (state ``silent``)."""
+"""Age of a heartbeat above which its node is silent, in seconds."""
 EVERY_NODES = ("/heartbeat", "/diagnostics", "/rosout")
-"""Last parts of the topics that every node publishes. A node that stops them is silent, not slow."""
+"""Last parts of the topics that every node publishes. Without them, a node is silent, not slow."""
 
 
 @dataclass(frozen=True)
 class Flow:
-    """One topic in or out of a node; ``age_s``: since the newest message, inf before the first."""
+    """One input or output topic of a node; ``age_s`` is the age of the newest message, inf before the first."""
 
     rate_hz: float
     age_s: float = math.inf
@@ -32,7 +32,7 @@ class Heartbeat:
         message: text of its worst diagnosis; empty when all is well.
         cpu_percent: load in percent of one core.
         inputs, outputs: rate and age of each topic.
-        lost: (topic, publisher) → messages that this node has lost.
+        lost: number of messages that this node has lost, by (topic, publisher).
         seen_s: monotonic time at which the heartbeat arrived.
     """
 
@@ -54,12 +54,12 @@ class Heartbeat:
 
     @property
     def up(self) -> bool:
-        """True if the node reports that it runs."""
+        """True if the node reports that it is running."""
         return self.state in ("running", "degraded")
 
 
 def from_message(message: Any) -> Heartbeat:
-    """Return the heartbeat of a NodeStatus message; lists of different lengths are cut to the shorter."""
+    """Return the heartbeat of a NodeStatus message. Lists of unequal length are cut to the shortest."""
     flows = zip(message.inputs, message.input_rates_hz, message.input_ages_s, strict=False)
     sent = zip(message.outputs, message.output_rates_hz, message.output_ages_s, strict=False)
     lost = zip(message.lost_topics, message.lost_publishers, message.lost_counts, strict=False)

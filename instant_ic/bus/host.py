@@ -1,4 +1,4 @@
-"""The part of a transport that its publishers and subscriptions share."""
+"""State of a transport that its publishers and subscriptions share."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _MOST_SOCKETS = 4096
 
 
 class Reader(Protocol):
-    """A subscription that is read when its descriptor is readable."""
+    """A subscription to read when its file descriptor is readable."""
 
     def discover(self) -> None: ...
     def read(self, one: bool = False) -> None: ...
@@ -36,9 +36,9 @@ class Host:
         self.node = registry.check_node_name(node)
         self.now_ns = now_ns
         self.steady_ns = steady_ns
-        self.next_order: Callable[[], int] = itertools.count().__next__  # a message's position in order of arrival
+        self.next_order: Callable[[], int] = itertools.count().__next__  # position of a message in order of arrival
         self.context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
         self.context.set(zmq.MAX_SOCKETS, _MOST_SOCKETS)
-        self.read_lock = threading.RLock()  # for the sockets of subscriptions
-        self.readers: dict[int, Reader] = {}  # by the descriptor of its socket
-        self.inputs = select.epoll()  # for the thread that waits for messages
+        self.read_lock = threading.RLock()  # guards the sockets of subscriptions
+        self.readers: dict[int, Reader] = {}  # open subscriptions by the descriptor of their socket
+        self.inputs = select.epoll()  # descriptors on which the node's thread waits

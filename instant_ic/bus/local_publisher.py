@@ -19,16 +19,16 @@ from instant_ic.bus.shm import LEAST_SLOTS, PeerProgress, Slot, SlotPool
 from instant_ic.bus.transport import Buffer, PublisherStats, TransportError
 
 SHARED_FROM_BYTES = 96 << 10
-"""Messages of this size and more go through shared memory. Below it, copying through a socket costs less than the
+"""Smallest message that goes through shared memory. For smaller messages, copying through a socket costs less than the
 bookkeeping (docs/benchmarks.md)."""
 
 SLOTS_A_READER = 5
-"""How many slots each reader adds to a publisher's limit; see also :data:`~.local_subscription.VIEWS_HELD`."""
+"""Number of slots by which each reader raises a publisher's limit; see :data:`~.local_subscription.VIEWS_HELD`."""
 
 _QUEUE_BYTES = 128 << 20
-"""Queue limits for a slow subscriber: messages sent inline, and large messages for which no slot was free."""
-LINGER_S = 0.2  # lets a last zero command leave when a node shuts down
-_NO_MEMORY_S = 5.0  # after a try for memory that failed
+"""Limit of the queue for a slow subscriber, in bytes of large messages for which no slot was free."""
+LINGER_S = 0.2  # time for the last messages, such as a zero command, to leave when a node shuts down
+_NO_MEMORY_S = 5.0  # wait after a failed allocation of shared memory
 _MORE = int(zmq.SNDMORE)
 _NOBLOCK = int(zmq.NOBLOCK)
 
@@ -41,7 +41,7 @@ class LocalPublisher:
     """Publisher of one topic of one node.
 
     Attributes:
-        closed: it takes no more messages, and its socket closes.
+        closed: true once the publisher takes no more messages.
 
     Raises:
         RegistryError: the node already publishes the topic, or the path is too long.
@@ -54,7 +54,7 @@ class LocalPublisher:
         self.stats = PublisherStats()
         self.subscriber_count = 0
         self._now_ns, self._steady_ns = host.now_ns, host.steady_ns
-        self._lock = threading.RLock()  # publish may be called from any thread; the bus thread serves subscriptions
+        self._lock = threading.RLock()  # any thread may publish, and the bus thread serves subscriptions
         self._name = topic.encode()
         self._type_hash = type_digest(type_name)
         self.identity = os.urandom(8)
@@ -62,7 +62,7 @@ class LocalPublisher:
         self._copies = 0  # subscribers that want large messages inline
         self._progress: dict[bytes, PeerProgress] = {}
         self.pool = SlotPool(self.identity)
-        self.inlined: deque[tuple[int, int]] = deque()  # sequence and size of large messages through the socket
+        self.inlined: deque[tuple[int, int]] = deque()  # sequence and size of large messages sent through the socket
         self._no_memory_until_s = 0.0
         self._last: _Message | None = None  # the latched value
         self.closed = False
@@ -70,8 +70,8 @@ class LocalPublisher:
         self._socket = host.context.socket(zmq.XPUB)
         try:
             self._socket.setsockopt(zmq.LINGER, int(LINGER_S * 1000))
-            self._socket.setsockopt(zmq.XPUB_VERBOSER, 1)  # each subscription is seen here, not only a key's first
-            # For good: libzmq can stall a connection for ever when the limit is lowered on a socket in use.
+            self._socket.setsockopt(zmq.XPUB_VERBOSER, 1)  # report every subscription, not only the first of a key
+            # Set once: libzmq can stall a connection for ever when the limit of a socket in use is lowered.
             self._socket.setsockopt(zmq.SNDHWM, _QUEUE_BYTES // SHARED_FROM_BYTES)
             self._socket.bind(f"ipc://{self.path}")
             self.path.chmod(0o600)
@@ -86,7 +86,7 @@ class LocalPublisher:
         self._send_part = super(zmq.Socket, self._socket).send  # without pyzmq's layer for other kinds of sockets
 
     def send(self, payload: Buffer, publish_ns: int | None = None) -> None:
-        """Send one message without waiting. The payload may be changed as soon as this returns.
+        """Send one message without waiting. The caller may change the payload once this returns.
 
         Raises:
             TransportError: the message is larger than 4 GiB.
@@ -106,7 +106,7 @@ class LocalPublisher:
         self.stats.add(self._steady_ns())
 
     def send_filled(self, size: int, fill: Callable[[memoryview], None], publish_ns: int | None = None) -> None:
-        """Send ``size`` bytes that ``fill`` writes in place, without a further copy and without waiting.
+        """Send ``size`` bytes that ``fill`` writes straight into the message, without waiting.
 
         Raises:
             TransportError: the message is larger than 4 GiB.
@@ -137,13 +137,14 @@ class LocalPublisher:
                 fill(memoryview(body))
                 self._send(size, body, publish_ns)
             else:
-                self.sequence += 1  # readers count the gap
+                self.sequence += 1  # readers count the gap as a loss
         self.stats.add(self._steady_ns())
 
     def serve(self) -> None:
         """Handle new and ended subscriptions.
 
-        On the bus thread, when :attr:`fd` is readable; and every second, since sending may take the event from it.
+        The bus thread calls this when :attr:`fd` is readable, and every second, because sending may consume the
+        descriptor's event.
         """
         with self._lock:
             while not self.closed and int(self._socket.getsockopt(zmq.EVENTS)) & zmq.POLLIN:
@@ -157,13 +158,13 @@ class LocalPublisher:
                     self._on_subscription(request[1:], request[0] == 1)
 
     def close(self) -> None:
-        """End the topic and remove it from the registry; the last messages get up to 0.2 s to leave."""
+        """Remove the publisher from the registry. The last messages get up to 0.2 s to leave."""
         with self._lock:
             if self.closed:
                 return
             deadline = time.monotonic() + LINGER_S
             newest = max((slot.written for slot in self.pool.slots), default=0)
-            # A slot can be opened only as long as this process keeps it.
+            # Readers can open a slot only while this process keeps it.
             while self.subscriber_count and self._read_by_all()[1] < newest and time.monotonic() < deadline:
                 time.sleep(0.002)
                 self.serve()
@@ -174,7 +175,7 @@ class LocalPublisher:
     # -- under the lock --------------------------------------------------------------------------
 
     def _leave(self) -> None:
-        """Close the socket and free the name; libzmq leaves its file in place."""
+        """Close the socket, remove its file, which libzmq leaves behind, and free the name."""
         self._socket.close()
         self.path.unlink(missing_ok=True)
         self._claim.release()
@@ -190,7 +191,7 @@ class LocalPublisher:
             self._last = (*message[:3], bytes(body), slot)
 
     def _emit(self, message: _Message, copy: bool = False) -> None:
-        """Send a message; ``copy`` means one in shared memory to the subscribers that want it inline."""
+        """Send a message. ``copy`` sends a shared one inline to the subscribers that need it inline."""
         sequence, publish_ns, size, body, slot = message
         name, kind = self._name, INLINE if slot is None else SHARED
         if slot is not None and copy:
@@ -201,7 +202,7 @@ class LocalPublisher:
         self._send_part(body)
 
     def _has_room(self, size: int) -> bool:
-        """Return whether a large message may go through the socket; the limit counts messages, not bytes."""
+        """Return whether the queue has room for a large message. ZeroMQ's own limit counts messages, not bytes."""
         seen = min((progress.sequence() for progress in self._progress.values()), default=self.sequence)
         while self.inlined and self.inlined[0][0] <= seen:
             self.inlined.popleft()
@@ -211,10 +212,10 @@ class LocalPublisher:
         return True
 
     def _slot(self, size: int) -> Slot | None:
-        """Return a locked slot, or None when this message must go through the socket."""
+        """Return a locked slot, or None if the message must go through the socket."""
         why = "readers hold all slots"
         most = LEAST_SLOTS + SLOTS_A_READER * self.subscriber_count
-        if time.monotonic() < self._no_memory_until_s:  # a try takes as long as a message, and what memory there is
+        if time.monotonic() < self._no_memory_until_s:  # a failing allocation is slow and uses up the free memory
             why, most = self.stats.not_shared_why, 0
         try:
             keep = self._last[4] if self._last else None
@@ -223,15 +224,17 @@ class LocalPublisher:
         except OSError as error:
             why = f"no shared memory for {size} bytes: {error.strerror or error}"
             self._no_memory_until_s = time.monotonic() + _NO_MEMORY_S
-            log.warning("%s: %s; large messages go through the socket, slower", self.topic, why)
+            log.warning("%s: %s. Large messages go through the socket, which is slower", self.topic, why)
         self.stats.not_shared += 1
         self.stats.not_shared_why = why
         return None
 
     def _read_by_all(self) -> tuple[int, int]:
-        """Sequences up to which all readers that want every message, and all readers, have looked at the messages."""
+        """Return the newest sequence that every lossless reader has looked at, and the newest that every reader has."""
         must = self.sequence
-        should = must if self.subscriber_count <= len(self._progress) else 0  # others announce no progress
+        should = (
+            must if self.subscriber_count <= len(self._progress) else 0
+        )  # a reader without an announcement is unknown
         for progress in self._progress.values():
             sequence = progress.sequence()
             should = min(should, sequence)
@@ -242,7 +245,7 @@ class LocalPublisher:
     # -- subscriptions ---------------------------------------------------------------------------
 
     def _on_subscription(self, prefix: bytes, begins: bool) -> None:
-        """Count a reader, and give it the last value; the others get it again and know its sequence."""
+        """Count a reader and send the last value. Other readers get it again and ignore it by its sequence."""
         every = self._name.startswith(prefix)
         inline, copies = every or prefix == self._name + bytes([INLINE]), prefix == KEY_COPY + self._name
         self.subscriber_count += inline if begins else -inline

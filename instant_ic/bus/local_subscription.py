@@ -33,39 +33,39 @@ from instant_ic.bus.shm import Slot, progress_page, store_progress
 from instant_ic.bus.transport import Received, Stats
 
 VIEWS_HELD = 4
-"""How many views into shared memory one reader keeps of a publisher. Further messages are copied, so that a queue, or
-a node that collects messages, cannot use up the publisher's slots."""
+"""Number of views into a publisher's shared memory that one reader keeps. Further messages are copied, so that a queue
+or a node that collects messages cannot use up the publisher's slots."""
 
-_QUEUE = 256  # messages that ZeroMQ keeps in this process; the publisher keeps more
+_QUEUE = 256  # messages that ZeroMQ queues in this process; the publisher queues more
 _LARGE_FROM_BYTES = 64 << 10
 _RECONNECT_MS = 20
-_GRACE_S = 2.0  # the last messages of a publisher that has left the registry may still be on the way
+_GRACE_S = 2.0  # time in which the last messages of a publisher that has left the registry may still arrive
 _SEARCH_S = 1.0
 _MOST_COMPLAINTS = 64
 _NOBLOCK, _EVENTS, _POLLIN = int(zmq.NOBLOCK), int(zmq.EVENTS), int(zmq.POLLIN)
-_leases: dict[Slot, weakref.ref[Any]] = {}  # of messages in use, also when their subscription is gone
-_new = tuple.__new__  # what Received(...) calls in the end, without a Python call in between
+_leases: dict[Slot, weakref.ref[Any]] = {}  # slots of messages in use, kept even if their subscription is closed
+_new = tuple.__new__  # faster than Received(...), which calls it through a Python function
 
 log = logging.getLogger(__name__)
 
 
 class _Source:
-    """One publisher of the topic; ``place`` is its place on the page of progress."""
+    """One publisher of the topic; ``place`` is its index on the progress page."""
 
     def __init__(self, info: registry.PublisherInfo, place: int) -> None:
         self.info = info
         self.node, self.type_name = info.node, info.type_name
-        self.address = f"ipc://{info.socket}"  # a successor of the same node has the same
+        self.address = f"ipc://{info.socket}"  # a restarted publisher of the same node has the same address
         self.place = place
-        self.left_s = 0.0  # when it was noticed that it has left the registry; 0: it has not
+        self.left_s = 0.0  # time at which it was found missing in the registry; 0 while it is present
         self.expected = 0  # sequence of the next message; 0 before the first
         self.slots: dict[int, Slot] = {}
-        self.mapped = False  # a slot could be opened once, so that others can be
+        self.mapped = False  # true once a slot could be opened; shared memory then works with this publisher
         self.views = 0
 
 
 class LocalSubscription:
-    """Subscription of one topic, for all its publishers.
+    """Subscription to all publishers of one topic.
 
     Raises:
         RegistryError: the topic's name is invalid, or its folder cannot be used.
@@ -103,7 +103,7 @@ class LocalSubscription:
     # -- on the reading thread, under the read lock ------------------------------------
 
     def discover(self) -> None:
-        """Connect to new publishers and disconnect from those that left; :meth:`read` must follow.
+        """Connect to new publishers and disconnect from those that have left. Call :meth:`read` afterwards.
 
         Raises:
             OSError: the run directory is gone.
@@ -121,7 +121,7 @@ class LocalSubscription:
         return any(source.address == address for source in self.sources.values())
 
     def _connect(self) -> None:
-        """Connect to the publishers that are new in the registry, and note which have left it."""
+        """Connect to publishers that are new in the registry, and record which have left it."""
         present = {bytes.fromhex(info.id): info for info in self.folder.publishers}
         for identity in present.keys() - self.sources.keys():
             taken = {source.place for source in self.sources.values()}
@@ -132,12 +132,14 @@ class LocalSubscription:
                 except zmq.ZMQError as error:
                     self._complain(source.address, f"{source.address} cannot be connected: {error}")
                     continue
-            self.sources[identity] = source  # its messages are known from now on, also after it has left
+            self.sources[identity] = (
+                source  # its messages are accepted from now on, even after it has left the registry
+            )
         for identity, source in self.sources.items():
             source.left_s = 0.0 if identity in present else source.left_s or time.monotonic()
 
     def read(self, one: bool = False) -> None:
-        """Read all messages that have arrived, or only ``one``: looking for more would delay it, but must follow."""
+        """Read all messages that have arrived, or only ``one``, to handle it sooner; a full read must then follow."""
         socket = self.socket
         receive = socket.recv
         while one or int(socket.getsockopt(_EVENTS)) & _POLLIN:
@@ -146,7 +148,7 @@ class LocalSubscription:
             except zmq.Again:
                 return
             try:
-                # A missing part shows as the next message's first, or as none: neither is a body of that size.
+                # If a part is missing, the next message's first part or none is read. Neither has the body's size.
                 header = unpack_header(first)
                 if header[0] == SHARED or header[6] < _LARGE_FROM_BYTES:
                     self._message(header, receive(_NOBLOCK))
@@ -165,7 +167,7 @@ class LocalSubscription:
         kind, _, sequence, publish_ns, publisher, digest, size = header
         source = self.sources.get(publisher) or self._met(publisher)
         gap = sequence - source.expected if source.expected else 0
-        if gap < 0:  # a latched value, sent again
+        if gap < 0:  # a latched value that was sent again
             return
         if self._digest is not None and digest != self._digest:
             self._refuse(source)
@@ -184,7 +186,7 @@ class LocalSubscription:
         if payload is None:
             return
         node, steady, order = source.node, self._steady_ns(), self._next_order()
-        # The type is the subscription's, or the registry's if the subscription accepts any.
+        # The type has been checked, unless the subscription accepts any type; then the registry's is used.
         message = _new(
             Received,
             (self.topic, source.type_name, payload, publish_ns, self._now_ns(), order, node, steady, publisher),
@@ -202,10 +204,10 @@ class LocalSubscription:
         self.stats.add(steady)
 
     def _met(self, publisher: bytes) -> _Source:
-        """Return the publisher of a first message.
+        """Look up the publisher of a first message in the registry.
 
         Raises:
-            FrameError: the registry does not name it.
+            FrameError: the registry does not list the publisher.
         """
         now = time.monotonic()
         if now >= self._next_search_s:
@@ -214,10 +216,10 @@ class LocalSubscription:
             if publisher in self.sources:
                 return self.sources[publisher]
             self._next_search_s = now + _SEARCH_S
-        raise FrameError(f"message of a publisher that is not in the registry (identity {publisher.hex()})")
+        raise FrameError(f"message from a publisher that is not in the registry (identity {publisher.hex()})")
 
     def _shared(self, source: _Source, header: Header, body: bytes | memoryview) -> memoryview | None:
-        """Return the message in shared memory; None when its slot holds another message by now."""
+        """Return the message in shared memory, or None if its slot already holds another message."""
         if len(body) != REFERENCE.size:
             raise FrameError(f"reference of {len(body)} bytes; it has {REFERENCE.size}")
         pid, fd, number, oldest = REFERENCE.unpack(body)
@@ -240,13 +242,13 @@ class LocalSubscription:
             slot.unlock()
             return copy
         array = np.frombuffer(slot.view(size), np.uint8)
-        # Everything derived from the message refers to this array: when it is freed, nothing reads the slot any more.
+        # Everything derived from the message refers to this array. Once it is freed, nothing reads the slot any more.
         _leases[slot] = weakref.ref(array, lambda _: self._done(source, slot, sequence))
         source.views += 1
         return array.data
 
     def _done(self, source: _Source, slot: Slot, sequence: int) -> None:
-        """Unlock a slot when its last view is gone; may run in any thread."""
+        """Unlock a slot once its last view is freed. This may run on any thread."""
         if slot.sequence != sequence:
             self.stats.overwritten += 1
             log.error("%s: %s overwrote a message that was still in use", self.topic, source.node)
@@ -255,16 +257,16 @@ class LocalSubscription:
         slot.unlock()
 
     def _without_shared_memory(self, source: _Source, sequence: int, error: OSError) -> NoReturn:
-        """Replace the subscription by one to inline messages only."""
+        """Subscribe to inline messages instead of shared ones."""
         if KEY_COPY not in self._told:
             self._told.add(KEY_COPY)
-            source.expected = source.expected or sequence  # the last value comes again
+            source.expected = source.expected or sequence  # the latched value is sent again
             for wanted in (self._name + bytes([INLINE]), KEY_COPY + self._name):
                 self.socket.setsockopt(zmq.SUBSCRIBE, wanted)
             for unwanted in (self._name, self._announcement):
                 self.socket.setsockopt(zmq.UNSUBSCRIBE, unwanted)
         raise FrameError(
-            f"shared memory of {source.node} cannot be used ({error.strerror or error}); asking for large messages "
+            f"shared memory of {source.node} cannot be used ({error.strerror or error}); large messages are requested "
             "through the socket, which is slower"
         )
 
@@ -295,9 +297,9 @@ class LocalSubscription:
         return messages
 
     def close(self) -> None:
-        """Close the socket; views of messages stay valid."""
+        """Close the socket. Views of messages stay valid."""
         with self._host.read_lock:
-            if self._host.readers.get(self.fd) is self:  # not closed before
+            if self._host.readers.get(self.fd) is self:  # else it is closed already
                 del self._host.readers[self.fd]
                 self._host.inputs.unregister(self.fd)
                 self.socket.close()

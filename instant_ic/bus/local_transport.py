@@ -1,12 +1,12 @@
-"""Topics of one node on one machine: ZeroMQ sockets found through the registry; no broker, no master.
+"""Topics of one node on one machine: ZeroMQ sockets found through the registry, without a broker or master.
 
-Which thread reads: while the node's thread waits in :meth:`LocalTransport.wait`, it reads its own sockets, so a message
-wakes only that thread. When it has been away for longer (a long callback), the bus thread reads instead. The bus thread
-also serves new subscriptions and looks for publishers; between these looks it sleeps, since a thread that wakes runs
-with cold caches and costs ten times what it costs in a row of messages.
+While the node's thread waits in :meth:`LocalTransport.wait`, it reads the sockets itself, so a message wakes only that
+thread. During a long callback of the node, the bus thread reads instead. The bus thread also serves new subscriptions
+and looks for publishers. It sleeps in between, because a thread that has just woken up has cold caches and needs ten
+times as long per message as one that keeps running.
 
-Both wait on the sockets' file descriptors and touch a socket only under a lock, since ZeroMQ's are not thread-safe.
-A thread that touches one must read all it has: its descriptor does not report an event twice.
+Both threads wait on the sockets' file descriptors. ZeroMQ's sockets are not thread-safe, so both use them only under a
+lock. A thread that uses a socket must read all its messages, because the descriptor does not report an event twice.
 """
 
 from __future__ import annotations
@@ -28,23 +28,23 @@ from instant_ic.bus.qos import QoS
 
 _LOOK_S = 0.2
 _IDLE_S = 1.0
-_AWAY_S = 0.015  # without a wait for longer, the bus thread reads: from when it is next awake
+_AWAY_S = 0.015  # time since the node's last wait after which the bus thread reads, the next time that it is awake
 _CLOSE_S = 5.0
 
 log = logging.getLogger(__name__)
 
 
 class LocalTransport(Host):
-    """Topics of one node, and the event that its thread waits on: waiting reads the node's sockets.
+    """Topics of one node, and the event that its thread waits for. Waiting also reads the node's sockets.
 
     Args:
         run_dir: the run directory; created if missing.
-        node: the node's name; also names its publishers' sockets.
+        node: the node's name, which is also the file name of its publishers' sockets.
         now_ns: the node's clock, for stamps.
         steady_ns: the node's steady clock, for rates and ages.
 
     Attributes:
-        patient: messages do not end a wait; they are read when it ends.
+        patient: true if messages do not end a wait; they are read at its end.
 
     Raises:
         RegistryError: the run directory cannot be used.
@@ -55,11 +55,11 @@ class LocalTransport(Host):
     ) -> None:
         super().__init__(run_dir, node, now_ns, steady_ns)
         self.patient = False
-        self._driver: int | None = None  # the thread that waits
+        self._driver: int | None = None  # id of the thread that waits
         self._set = self._waiting = False
-        self._left_s = 0.0  # when it last stopped waiting
+        self._left_s = 0.0  # monotonic time at which the last wait ended
         self._next_look_s = 0.0
-        self._unread: list[int] = []  # of these sockets only one message was read
+        self._unread: list[int] = []  # sockets of which only one message was read
         self._writers: list[LocalPublisher] = []
         self._wake, self._poke = (os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC) for _ in range(2))
         self.inputs.register(self._wake, select.EPOLLIN)
@@ -68,18 +68,18 @@ class LocalTransport(Host):
         self._thread.start()
 
     def set(self) -> None:
-        """End the present or the next wait; may be called from any thread."""
+        """End the present or the next wait. Any thread may call this."""
         if not self._set:
             self._set = True
             if threading.get_ident() != self._driver:
                 os.eventfd_write(self._wake, 1)
 
     def clear(self) -> None:
-        """Let later waits wait."""
+        """Reset the event, so that later waits do not end at once."""
         self._set = False
 
     def advertise(self, topic: str, type_name: str, qos: QoS) -> LocalPublisher:
-        """Create a publisher, which readers can find at once.
+        """Create a publisher. Readers can find it at once.
 
         Raises:
             RegistryError: the node already publishes the topic, or the path is too long.
@@ -94,11 +94,11 @@ class LocalTransport(Host):
         """Subscribe to all present and future publishers.
 
         Args:
-            topic: topic to read.
-            type_name: its type; None accepts any.
-            qos: queue of the subscription.
-            on_ready: called when :meth:`LocalSubscription.take` has messages again, on the thread that reads; it must
-                not wait.
+            topic: name of the topic.
+            type_name: type of the topic; None accepts any type.
+            qos: preset that sets the queue's length.
+            on_ready: function called on the reading thread when :meth:`LocalSubscription.take` has messages again; it
+                must not block.
         """
         with self.read_lock:
             subscription = LocalSubscription(self, topic, type_name, qos, on_ready)
@@ -107,7 +107,7 @@ class LocalTransport(Host):
         return subscription
 
     def close(self) -> None:
-        """Close everything; the last messages get up to 0.2 s to leave."""
+        """Close all topics. The last messages get up to 0.2 s to leave."""
         if self._stop.is_set():
             return
         self._stop.set()
@@ -118,23 +118,25 @@ class LocalTransport(Host):
         for publisher in self._writers:
             publisher.close()
         with self.read_lock:
-            self._set = True  # later calls of `set` do nothing
+            self._set = True  # makes later calls of `set` do nothing
             self.inputs.close()
             os.close(self._wake)
             os.close(self._poke)
         started_s = time.monotonic()
         self.context.term()
-        if time.monotonic() - started_s > LINGER_S / 2:  # no later message will reveal the gap to the readers
-            log.warning("%s closed: its last messages are lost, a reader was too slow to take them", self.node)
+        if (
+            time.monotonic() - started_s > LINGER_S / 2
+        ):  # readers cannot detect the loss, as no later message shows a gap
+            log.warning("%s closed, but a reader was too slow: its last messages are lost", self.node)
 
     # -- reading ---------------------------------------------------------------------------------
 
     def wait(self, timeout: float) -> None:
-        """Read the node's sockets until a message arrives, the event is set, or the time is over."""
+        """Read the node's sockets until a message arrives, the event is set or the time-out has passed."""
         self._driver = threading.get_ident()
-        self._read(self._unread)  # sets the event: its descriptors will not report what this reads
+        self._read(self._unread)  # a message found here sets the event, because no descriptor reports it
         timeout = 0.0 if self._set else timeout
-        self._waiting = timeout > 0.0  # a mere look leaves the reading to the bus thread, if that has taken over
+        self._waiting = timeout > 0.0  # a wait of zero does not take the reading over from the bus thread
         patient = self.patient
         if patient:
             ready = [*_readable([self._wake], timeout), *self.readers]
@@ -142,7 +144,7 @@ class LocalTransport(Host):
             ready = [fd for fd, _ in self.inputs.poll(timeout, 64)]
         self._read(ready, one=not patient)
         self._unread = [] if patient else ready
-        if self._wake in ready:  # left as it is, it would end every later wait
+        if self._wake in ready:  # else the eventfd would end every later wait
             with contextlib.suppress(BlockingIOError):
                 os.eventfd_read(self._wake)
         self._waiting, self._left_s = False, time.monotonic()
@@ -169,7 +171,7 @@ class LocalTransport(Host):
                         timeout_s = min(timeout_s, away_in_s)
                     else:
                         inputs = list(self.readers)
-                        self._read(self._unread)  # their descriptors will not report what is there already
+                        self._read(self._unread)  # their descriptors do not report messages that have arrived already
                 ready = _readable([self._poke, *writers, *inputs], max(0.0, timeout_s))
                 if self._poke in ready:
                     os.eventfd_read(self._poke)
@@ -179,7 +181,7 @@ class LocalTransport(Host):
                 if not self._waiting:
                     self._read(ready)
             except Exception as error:  # one bad event must not stop the bus
-                expected = isinstance(error, OSError)  # the run directory is gone
+                expected = isinstance(error, OSError)  # such as a missing run directory
                 log.error("%s: fault on the bus thread: %s", self.node, error, exc_info=not expected)
                 self._stop.wait(_AWAY_S)
 
@@ -194,10 +196,10 @@ class LocalTransport(Host):
             publisher.serve()
         for fd, subscription in list(self.readers.items()):
             with self.read_lock:
-                if self.readers.get(fd) is subscription:  # not just closed
+                if self.readers.get(fd) is subscription:  # else it has just been closed
                     try:
                         subscription.discover()
-                    except Exception as error:  # noqa: BLE001 - raised below: other topics do not wait for this one
+                    except Exception as error:  # noqa: BLE001 - raised below, after the other topics
                         fault = error
                     if not self.patient:  # a patient node reads all sockets when it wakes
                         subscription.read()

@@ -1,7 +1,7 @@
-"""A bus in one process, without threads or sockets: real nodes run in lockstep with their messages.
+"""A bus in one process, without threads or sockets, on which real nodes run in lockstep with their messages.
 
-Every message still goes through CDR, in the order of publication. So a node behaves as it does between processes, and
-the same input gives the same output, bit for bit.
+Every message goes through CDR, in the order of publication. A node therefore behaves as it does in a process of its
+own, and the same input gives bit-identical output.
 """
 
 from __future__ import annotations
@@ -112,13 +112,13 @@ class _Transport(threading.Event):
 
 
 class LockstepBus(Closing):
-    """Drives nodes with a manual clock.
+    """Runs nodes with a manual clock.
 
     Args:
-        start_ns: the clock's first value.
-        keep: keep all messages for :meth:`messages`; switch it off for long replays.
-        on_record: called with every message that a node publishes, for a recorder.
-        run_dir: run directory of the nodes; None: they have none.
+        start_ns: first value of the clock.
+        keep: keep all messages for :meth:`messages`; set it to False for long replays.
+        on_record: function called with every message that a node publishes, for a recorder.
+        run_dir: run directory of the nodes; None if they have none.
     """
 
     def __init__(
@@ -153,10 +153,10 @@ class LockstepBus(Closing):
 
         Args:
             node_class: class of the node.
-            config: parameters; the defaults if None.
-            name: name of the node; that of its class if None.
+            config: parameters; None uses the defaults.
+            name: name of the node; None uses its class's name.
             namespace: prefix of its topics.
-            remaps: topic → topic.
+            remaps: names of topics and their replacements.
             parts: further arguments of the node's constructor, such as a simulated device.
         """
         configuration = node_class.config_class()() if config is None else config
@@ -172,7 +172,7 @@ class LockstepBus(Closing):
     def publish(
         self, topic: str, message: Any, stamp_ns: int | None = None, latched: bool = False, publisher: str = ""
     ) -> None:
-        """Publish in the name of ``publisher``; first advances the clock to ``stamp_ns``, firing timers on the way."""
+        """Publish as node ``publisher``, after the clock has advanced to ``stamp_ns`` and the timers up to it fired."""
         self.publish_bytes(topic, type_name(message), bytes(serialize(message)), stamp_ns, latched, publisher)
 
     def publish_bytes(
@@ -184,7 +184,7 @@ class LockstepBus(Closing):
         latched: bool = False,
         publisher: str = "",
     ) -> None:
-        """Like :meth:`publish`, with CDR bytes."""
+        """Publish CDR bytes; see :meth:`publish`."""
         if stamp_ns is not None:
             self.advance_to(stamp_ns)
         qos = LATCHED if latched else QoS("outside", 1000)
@@ -192,7 +192,7 @@ class LockstepBus(Closing):
         self._run()
 
     def advance_to(self, now_ns: int) -> None:
-        """Advance the clock, firing every timer at its own time; a time in the past changes nothing."""
+        """Advance the clock and fire every timer at its own time. A time in the past changes nothing."""
         while True:
             due = [t for node in self.nodes if (t := node.timers.next_ns()) is not None]
             if not due or min(due) > now_ns:
@@ -206,7 +206,7 @@ class LockstepBus(Closing):
         self.advance_to(self.clock.now_ns() + int(seconds * 1e9))
 
     def records(self, topic: str) -> list[Record]:
-        """Return all messages of a topic, as sent over the bus."""
+        """Return all messages of a topic as they were sent."""
         return list(self._records.get(topic, ()))
 
     def messages(self, topic: str) -> list[Any]:
@@ -214,12 +214,12 @@ class LockstepBus(Closing):
         return [deserialize(r.payload, r.type_name) for r in self._records.get(topic, ())]
 
     def last(self, topic: str) -> Any:
-        """Return the newest message of a topic, decoded; None before the first."""
+        """Return the newest message of a topic, decoded, or None before the first."""
         records = self._records.get(topic)
         return deserialize(records[-1].payload, records[-1].type_name) if records else None
 
     def kill(self, node: Node[Any]) -> None:
-        """Remove a node as SIGKILL does: no teardown, and its latched values are gone."""
+        """Remove a node as SIGKILL does: without teardown, and with the loss of its latched values."""
         self.nodes.remove(node)
         transport = self._transports.pop(node)
         for subscriptions in self.subscriptions.values():
@@ -228,7 +228,7 @@ class LockstepBus(Closing):
             values.pop(node.node_name, None)
 
     def close(self) -> None:
-        """Run every node's ``teardown``, the last added first."""
+        """Run every node's ``teardown``, in the reverse order of :meth:`add`."""
         for node in reversed(self.nodes):
             node.close()
         self.nodes.clear()
@@ -266,7 +266,7 @@ class LockstepBus(Closing):
         """Put a message into the queue of one subscription."""
         if subscription.type_name not in (None, record.type_name):
             subscription.stats.rejected += 1
-            subscription.stats.rejected_why = f"{record.type_name} comes, {subscription.type_name} expected"
+            subscription.stats.rejected_why = f"{record.type_name} received, {subscription.type_name} expected"
             logging.getLogger(__name__).error("%s: %s; refused", record.topic, subscription.stats.rejected_why)
             return
         now = self.clock.now_ns()
@@ -288,18 +288,18 @@ class LockstepBus(Closing):
         )
 
     def _run(self) -> None:
-        """Run the nodes in turn until none has anything left to do at this time."""
+        """Run the nodes in turn until none has anything left to do at the present time."""
         for _ in range(100_000):
             ran = False
             for node in list(self.nodes):
-                # Check first: most nodes have nothing to do most of the time, and polling all queues is slow.
+                # Most nodes have nothing to do most of the time, and polling all their queues is slow.
                 if (self._transports[node].waiting or self._due(node)) and node.spin_once():
                     ran = True
             if not ran:
                 return
-        raise RuntimeError("the nodes answer each other without end at one time")
+        raise RuntimeError("the nodes answer each other endlessly at one instant")
 
     def _due(self, node: Node[Any]) -> bool:
-        """Return whether results of workers or timers are due."""
+        """Return whether a worker's result or a timer is due."""
         timer_ns = node.timers.next_ns()
         return bool(node.callbacks.soon) or (timer_ns is not None and timer_ns <= self.clock.steady_ns())

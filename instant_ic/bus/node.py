@@ -1,4 +1,4 @@
-"""Base class of nodes: topics, timers, clock and the loop; parameters, diagnostics and transforms are objects of it."""
+"""Base class of nodes: topics, timers, clock, the loop, and objects for parameters, diagnostics and transforms."""
 
 from __future__ import annotations
 
@@ -30,39 +30,39 @@ from instant_ic.util.pace import current
 
 ConfigT = TypeVar("ConfigT")
 
-_REPORT_S = 1.0  # period of heartbeat and diagnostics, which also sees a stop flag set by a signal
+_REPORT_S = 1.0  # period of heartbeat and diagnostics, and of the check of a stop flag set by a signal
 
 
 class Node(Generic[ConfigT]):
-    """Base class of every process of the stack; docs/architecture.md explains how to write one.
+    """Base class of every process of the stack; docs/architecture.md explains how to write a node.
 
     Args:
         config: typed parameters.
-        transport: topics.
-        clock: time; a :class:`ManualClock` where ``/clock`` or a test sets it.
-        name: used instead of the class's name.
+        transport: topics of the node.
+        clock: clock of the node; a :class:`ManualClock` if ``/clock`` or a test sets the time.
+        name: name of the node; None uses the class's name.
         namespace: prefix of every topic.
-        remaps: topic → topic, applied before the namespace.
-        lockstep: no threads and no heartbeat; the bus drives the node.
-        use_sim_time: the clock follows ``/clock``; callbacks wait for its first value.
+        remaps: names of topics and their replacements, applied before the namespace.
+        lockstep: run without threads and heartbeat; the lockstep bus drives the node.
+        use_sim_time: follow ``/clock``; callbacks wait for its first value.
 
     Attributes:
-        parameters: values, and changes of live ones while the node runs.
-        diagnostics: named states; set one by :meth:`diagnose`.
-        transforms: broadcasts transforms; look one up by :attr:`tf`.
-        timers: the node's timers; add one by :meth:`timer`.
+        parameters: parameters of the node, of which live ones can change while it runs.
+        diagnostics: diagnoses of the node; :meth:`diagnose` sets one.
+        transforms: broadcasts transforms; :attr:`tf` looks transforms up.
+        timers: the node's timers; :meth:`timer` adds one.
         callbacks: runs the node's callbacks one after another.
         node_report: publishers of log, heartbeat and diagnostics; None before :meth:`start` and in lockstep.
-        commands: commands that the control channel's ``call`` can run: name → function with keyword arguments. The
-            result goes back as JSON; a ``ValueError`` or ``NodeError`` goes back as the reason of a refusal.
+        commands: functions that the control channel's ``call`` can run, by name, with keyword arguments. The result is
+            returned as JSON, a ``ValueError`` or ``NodeError`` as the reason for a refusal.
         run_state: ``STARTING``, ``RUNNING`` or ``STOPPING``.
-        on_registry_change: called when topics or parameters change.
+        on_registry_change: function called when topics or parameters change.
     """
 
     name: ClassVar[str] = "node"
     live_parameters: ClassVar[tuple[str, ...]] = ()
-    """Parameters, or whole groups, that can be changed while the node runs. These are the parameters that the node
-    reads from ``self.config`` at each use, and those that its :meth:`reconfigure` applies. ``"*"`` means all."""
+    """Parameters or groups of parameters that can be changed while the node runs: those that the node reads from
+    ``self.config`` at each use, and those that its :meth:`reconfigure` applies. ``"*"`` means all."""
 
     def __init__(
         self,
@@ -103,25 +103,26 @@ class Node(Generic[ConfigT]):
     # -- for the node's author -------------------------------------------------------------------
 
     def setup(self) -> None:
-        """Create publishers, subscriptions and timers; overridden by each node."""
+        """Create publishers, subscriptions and timers. Each node overrides this."""
 
     def teardown(self) -> None:
-        """Leave devices in a safe state; called once, also after an error in ``setup``."""
+        """Leave devices in a safe state. This is called once, even after an error in ``setup``."""
 
     def reconfigure(self, config: ConfigT) -> None:
-        """Apply new values of live parameters, already checked by the dataclass; runs on the node's thread.
+        """Apply new values of live parameters, which the dataclass has checked, on the node's thread.
 
-        A node that builds something from its parameters overrides this: build the new object first, then call
+        A node that creates objects from its parameters overrides this. Create the new objects first, then call
         ``super()``.
 
         Raises:
-            ValueError, NodeError: the values cannot be used; nothing has been changed.
+            ValueError: the values cannot be used; nothing has been changed.
+            NodeError: likewise.
         """
         self.config = config
 
     @classmethod
     def config_class(cls) -> type[Any]:
-        """Return the dataclass given in ``class X(Node[Config])``."""
+        """Return the dataclass of the node's parameters, from ``class X(Node[Config])``."""
         for base in getattr(cls, "__orig_bases__", ()):
             arguments = get_args(base)
             if arguments and isinstance(arguments[0], type):
@@ -134,7 +135,7 @@ class Node(Generic[ConfigT]):
         return self._transport.run_dir
 
     def resolve(self, topic: str) -> str:
-        """Return the name of a topic after remaps and namespace."""
+        """Return the full name of a topic, with remaps and namespace applied."""
         topic = self._remaps.get(topic, topic)
         return f"/{self.namespace}{topic}" if self.namespace else topic
 
@@ -143,7 +144,7 @@ class Node(Generic[ConfigT]):
         return self.publisher_raw(topic, type_name(message_class), qos)
 
     def publisher_raw(self, topic: str, type_name: str, qos: QoS = SENSOR) -> Publisher:
-        """Create a publisher by type name, for bytes that are not decoded here."""
+        """Create a publisher of CDR bytes by the name of their type."""
         publisher = Publisher(self._transport.advertise(self.resolve(topic), type_name, qos))
         self.publishers.append(publisher)
         self.on_registry_change()
@@ -152,7 +153,7 @@ class Node(Generic[ConfigT]):
     def subscribe(
         self, topic: str, message_class: Any, callback: Callable[[Any], None], qos: QoS = SENSOR
     ) -> Subscription:
-        """Subscribe; ``callback(message)`` runs on the node's thread."""
+        """Subscribe to a topic; ``callback(message)`` runs on the node's thread."""
         name = type_name(message_class)
 
         def decode(received: Received) -> None:
@@ -163,7 +164,7 @@ class Node(Generic[ConfigT]):
     def subscribe_received(
         self, topic: str, callback: Callable[[Received], None], qos: QoS = RELIABLE, message_class: Any = None
     ) -> Subscription:
-        """Subscribe to bytes, with all that is known of a message; without ``message_class`` to any type."""
+        """Subscribe to undecoded messages with their reception data; without ``message_class``, of any type."""
         topic = self.resolve(topic)
         name = type_name(message_class) if message_class else None
         subscription = Subscription(topic, callback)
@@ -189,7 +190,7 @@ class Node(Generic[ConfigT]):
         qos: QoS = SENSOR,
         callback: Callable[[Any], None] = lambda message: None,
     ) -> Latest:
-        """Subscribe and keep the newest message of a topic; ``callback(message)`` runs once it is stored."""
+        """Subscribe and keep the newest message of a topic; ``callback(message)`` runs after each is stored."""
         latest = Latest(self.clock, max_age_s)
         name = type_name(message_class)
 
@@ -202,7 +203,7 @@ class Node(Generic[ConfigT]):
         return latest
 
     def timer(self, period_s: float, callback: Callable[[], None]) -> Timer:
-        """Call back once per period of the node's clock; missed periods are not caught up."""
+        """Call back once per period of the node's clock. Missed periods are skipped."""
         if period_s <= 0:
             raise ValueError(f"timer period must be > 0 (got {period_s})")
         period = int(period_s * 1e9)
@@ -212,31 +213,31 @@ class Node(Generic[ConfigT]):
         return timer
 
     def background(self, work: Callable[[Any], Any], on_result: Callable[[Any], None] | None = None) -> Worker:
-        """Start a worker thread for slow work on the newest item; ``on_result`` runs on the node's thread."""
+        """Start a worker thread that runs slow work on the newest item; ``on_result`` runs on the node's thread."""
         worker = Worker(self.callbacks, work, on_result, self.lockstep)
         self._workers.append(worker)
         return worker
 
     def call_soon(self, function: Callable[..., None], *args: Any) -> None:
-        """Run a function on the node's thread; may be called from any thread."""
+        """Run a function on the node's thread. Any thread may call this."""
         self.callbacks.call_soon(function, *args)
 
     def diagnose(self, name: str, level: int, message: str, **values: Any) -> None:
-        """Set a named diagnosis; it is published until the next one of that name."""
+        """Set a named diagnosis. It is published until another one of this name replaces it."""
         self.diagnostics.set(name, level, message, **values)
 
     def diagnose_all(self, *states: Diagnosis | None) -> None:
-        """Set the diagnoses that a library has made; None is left out."""
+        """Set the diagnoses that a library has made; None is ignored."""
         for state in states:
             if state is not None:
                 self.diagnose(state.name, state.level, state.text, **state.values)
 
     def diagnoses(self) -> dict[str, tuple[int, str, dict[str, Any]]]:
-        """Return the present diagnoses by name: level, message, values."""
+        """Return the present diagnoses (level, message, values) by name."""
         return dict(self.diagnostics.present)
 
     def stop(self) -> None:
-        """End the loop; may be called from any thread and from a signal handler."""
+        """End the loop. Any thread and a signal handler may call this."""
         self._stop.set()
         self._transport.set()
 
@@ -246,10 +247,10 @@ class Node(Generic[ConfigT]):
         return self._stop.is_set()
 
     def be_patient(self, patient: bool) -> None:
-        """Let messages wait until a timer or :meth:`call_soon` wakes the node, at least once a second, or no longer.
+        """Set whether messages wait until a timer or :meth:`call_soon` wakes the node, at least once a second.
 
-        For a node whose reaction is not urgent: a wake-up costs several times as much as a further message in the same
-        wake-up. Messages get the time of the wake-up as their time of arrival.
+        This suits a node whose reaction is not urgent, because a wake-up costs several times as much as handling one
+        more message. The time of the wake-up becomes the messages' time of arrival.
         """
         self._transport.patient = patient
 
@@ -261,7 +262,7 @@ class Node(Generic[ConfigT]):
     # -- the loop --------------------------------------------------------------------------------
 
     def start(self) -> None:
-        """Run ``setup``; called once by whatever drives the node."""
+        """Run ``setup``. The process or the lockstep bus calls this once."""
         if not self.lockstep:
             self.node_report = NodeReport(self)
         if self.use_sim_time:
@@ -285,16 +286,16 @@ class Node(Generic[ConfigT]):
             wait = next_report - now
             if (timer_ns := self.timers.next_ns()) is not None:
                 due_s = (timer_ns - self.clock.steady_ns()) / 1e9
-                # Simulated time may run slower or faster than the machine's, so its timers are checked often.
+                # Simulated time may run slower or faster than the machine's, so timers are checked often.
                 wait = min(wait, 0.01 if self.use_sim_time else current().wait_s(due_s))
             if not self.callbacks.soon:
                 self._transport.wait(max(0.0, wait))
 
     def spin_once(self) -> bool:
-        """Run what is due: results of workers, messages in order of arrival, timers.
+        """Run what is due: workers' results, messages in order of arrival, timers.
 
         Returns:
-            Whether anything ran.
+            True if anything ran.
         """
         ran = self._run_arrived()
         now_ns = self.clock.steady_ns()
@@ -315,7 +316,7 @@ class Node(Generic[ConfigT]):
             pending.sort(key=lambda entry: entry[0])
         for index, (_, subscription, received) in enumerate(pending):
             if index and subscription.raw.qos.depth == 1 and not self.lockstep:
-                # Earlier callbacks may have taken long: for a newest-only topic, use what has arrived since.
+                # Earlier callbacks may have taken long. For a newest-only topic, use what has arrived since.
                 self._transport.wait(0.0)
                 for newer in subscription.raw.take():
                     if newer.publisher == received.publisher:
@@ -327,8 +328,8 @@ class Node(Generic[ConfigT]):
         return ran
 
     def read_all(self) -> None:
-        """Run the callbacks of all messages that have arrived, also of those still in the sockets, but no timers."""
-        # A wait reads one message of each of 64 sockets at most, and all that is left in those of the wait before it.
+        """Run the callbacks of all messages that have arrived, including those still in the sockets, but no timers."""
+        # A wait reads one message from each of at most 64 sockets, and the rest from the sockets of the wait before.
         for _ in range(2 + len(self.subscriptions) // 64):
             self._transport.wait(0.0)
         self._run_arrived()
@@ -340,7 +341,7 @@ class Node(Generic[ConfigT]):
         try:
             try:
                 if self.node_report is not None:
-                    self.node_report.beat()  # the launcher must not take the node for dead
+                    self.node_report.beat()  # so that the launcher does not take the node for dead
             finally:
                 self.teardown()
         finally:

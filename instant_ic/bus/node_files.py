@@ -1,4 +1,4 @@
-"""Load the node class of a node file: a shipped ``nodes/NAME.py``, or a user's own file."""
+"""Loading of the node class in a node file: a shipped ``nodes/NAME.py`` or a user's own file."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from instant_ic.util import paths
 
 
 class NodeFileError(ValueError):
-    """The file is missing or does not define exactly one node; the message says which."""
+    """The file is missing or does not define exactly one node."""
 
 
 def node_class(name: str) -> type[Node[Any]]:
@@ -27,14 +27,14 @@ def node_class(name: str) -> type[Node[Any]]:
 
 
 def load(file: Path, module_name: str = "") -> type[Node[Any]]:
-    """Return the node class that a file defines. A process runs the file only once.
+    """Return the node class that a file defines. The file is executed once per process.
 
     Args:
         file: Python source with one subclass of `Node`.
-        module_name: key in ``sys.modules``; default: the file's stem.
+        module_name: key in ``sys.modules``; empty uses the file's stem.
 
     Raises:
-        NodeFileError: the file is missing, or defines no node or more than one.
+        NodeFileError: the file is missing, or does not define exactly one node.
     """
     name = module_name or file.stem
     module = sys.modules.get(name)
@@ -42,7 +42,7 @@ def load(file: Path, module_name: str = "") -> type[Node[Any]]:
         spec = importlib.util.spec_from_file_location(name, file)
         if spec is None or spec.loader is None or not file.is_file():
             raise NodeFileError(f"{file} {'is not a Python file' if file.is_file() else 'does not exist'}")
-        module = sys.modules[name] = importlib.util.module_from_spec(spec)  # dataclasses look up their module
+        module = sys.modules[name] = importlib.util.module_from_spec(spec)  # dataclasses look their module up there
         try:
             spec.loader.exec_module(module)
         except BaseException:

@@ -1,4 +1,4 @@
-"""Parameters of a running node: present values, and changes of live ones."""
+"""Parameters of a running node: their present values, and changes of live ones."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ class NodeParameters:
         self._node = node
 
     def infos(self) -> list[ParameterInfo]:
-        """Return all parameters with their present values; may be called from any thread."""
+        """Return all parameters with their present values. Any thread may call this."""
         node = self._node
         infos = parameter_infos(type(node.config), node.config, node.live_parameters)
         own = {info.name for info in infos}
@@ -27,13 +27,13 @@ class NodeParameters:
         return infos + [info for info in common if info.name not in own]
 
     def set(self, values: Mapping[str, Any]) -> dict[str, Any]:
-        """Change live parameters together, or none. Runs on the node's thread.
+        """Change live parameters together, or none, on the node's thread.
 
         Returns:
-            Those whose value changed.
+            The parameters whose value has changed.
 
         Raises:
-            ParameterError: a value is refused, or its parameter takes effect only at the start.
+            ParameterError: a value is refused, or its parameter cannot be changed while the node runs.
         """
         node = self._node
         own = {field.name for field in dataclasses.fields(type(node.config))}

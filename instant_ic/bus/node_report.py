@@ -22,16 +22,16 @@ from instant_ic.util.safe_text import masked
 
 
 class NodeReport:
-    """Publishes what one node reports about itself.
+    """Publishes a node's log, heartbeat and diagnostics.
 
     Attributes:
-        rosout, heartbeat, diagnostics: its publishers.
+        rosout, heartbeat, diagnostics: the publishers of the three.
     """
 
     def __init__(self, node: NodeInterface) -> None:
         self._node = node
         self._flows = FlowReport(time.monotonic_ns())
-        self._load = time.process_time(), time.monotonic()  # CPU seconds of the process, and when
+        self._load = time.process_time(), time.monotonic()  # CPU seconds of the process, and the time of this reading
         self.rosout: Publisher = node.publisher("/rosout", message_type("Log"), RELIABLE)
         self._handler = _RosoutHandler(node.node_name, self.rosout)
         for logger in _loggers(node.node_name):
@@ -41,12 +41,12 @@ class NodeReport:
         self.beat()
 
     def close(self) -> None:
-        """Publish the log no longer."""
+        """Stop publishing the log."""
         for logger in _loggers(self._node.node_name):
             logger.removeHandler(self._handler)
 
     def beat(self) -> None:
-        """Publish the heartbeat: state, load, topics and their losses."""
+        """Publish the heartbeat: state, load, topics and lost messages."""
         node = self._node
         now = node.clock.steady_ns()
         status = message_type("NodeStatus")
@@ -116,7 +116,7 @@ def set_log_level(node_name: str, level: str) -> None:
 
 
 def _loggers(node_name: str) -> tuple[logging.Logger, logging.Logger]:
-    """Return the node's own logger and the library's, whose modules do not know the node."""
+    """Return the node's own logger and the library's, which carries no node name."""
     return logging.getLogger(node_name), logging.getLogger("instant_ic")
 
 

@@ -14,7 +14,7 @@ from instant_ic.msg import MessageError, message_type, stamp_ns, transform_matri
 
 
 class NodeTransforms:
-    """The transforms of one node: a buffer of those on the bus, and its own on ``/tf`` and ``/tf_static``."""
+    """The transforms of one node: a buffer of the received ones, and publishers of its own."""
 
     def __init__(self, node: NodeInterface) -> None:
         self._node = node
@@ -25,7 +25,7 @@ class NodeTransforms:
 
     @property
     def buffer(self) -> TransformBuffer:
-        """Transforms of the bus; the first use subscribes to ``/tf`` and ``/tf_static``."""
+        """The received transforms. The first use subscribes to ``/tf`` and ``/tf_static``."""
         if self._buffer is None:
             self._buffer = TransformBuffer()
             transforms = message_type("TFMessage")
@@ -34,12 +34,12 @@ class NodeTransforms:
         return self._buffer
 
     def forget_moving(self) -> None:
-        """Drop all transforms of ``/tf``."""
+        """Drop all transforms received on ``/tf``."""
         if self._buffer is not None:
             self._buffer.forget_moving()
 
     def broadcast(self, parent: str, child: str, parent_from_child: Matrix, stamp: int) -> None:
-        """Publish one transform on ``/tf``; ``stamp`` in nanoseconds."""
+        """Publish one transform on ``/tf``; ``stamp`` is in nanoseconds."""
         transforms = message_type("TFMessage")
         if self._out is None:
             self._out = self._node.publisher("/tf", transforms, RELIABLE)

@@ -1,4 +1,4 @@
-"""Run one node as a process: command line, parameters, signals, registry."""
+"""One node as a process: command line, parameters, signals, registry."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from instant_ic.util import pace, paths
 from instant_ic.util.safe_text import masked, visible
 
 _SETUP_ENDS_S = 1.0
-"""How long a signal waits for a node's ``setup``; the launcher sends the next one after 2.5 s."""
+"""Time that a node's ``setup`` gets to end after a signal. The launcher sends its next signal after 2.5 s."""
 
 
 def argument_parser(node_class: type[Node[Any]]) -> argparse.ArgumentParser:
@@ -57,7 +57,7 @@ def argument_parser(node_class: type[Node[Any]]) -> argparse.ArgumentParser:
 
 
 def parse_remaps(words: Sequence[str]) -> dict[str, str]:
-    """Parse ``from:=to`` arguments.
+    """Parse ``from:=to`` arguments into names and their replacements.
 
     Raises:
         ParameterError: an argument has no ``:=``.
@@ -72,10 +72,10 @@ def parse_remaps(words: Sequence[str]) -> dict[str, str]:
 
 
 def _stop_on_signals(node: Node[Any]) -> None:
-    """End the loop on SIGINT and SIGTERM; teardown then runs on the node's own thread.
+    """End the loop on SIGINT and SIGTERM. Teardown then runs on the node's own thread.
 
-    A signal handler interrupts the main thread, which may hold the lock that :meth:`Node.stop` needs; the handler would
-    deadlock. So the handler does nothing, and a thread that learns of the signal through a pipe stops the node.
+    A signal handler interrupts the main thread, which may hold the lock that :meth:`Node.stop` needs. Calling it there
+    would deadlock. The handler therefore does nothing, and a thread that reads the signal from a pipe stops the node.
     """
     heard, written = os.pipe()
     os.set_blocking(written, False)
@@ -87,16 +87,16 @@ def _stop_on_signals(node: Node[Any]) -> None:
         os.read(heard, 1)
         node.stop()
         time.sleep(_SETUP_ENDS_S)
-        if node.run_state == "STARTING":  # in a compiler, or waiting for a device: no motor, bag or robot is in use yet
+        if node.run_state == "STARTING":  # in a compiler, or waiting for a device; no motor or bag is in use yet
             leave(0)
 
     threading.Thread(target=wait_for_signal, name="signals", daemon=True).start()
 
 
 def main(node_class: type[Node[Any]], argv: Sequence[str] | None = None) -> None:
-    """Run a node until SIGINT or SIGTERM; exits with 0, 1 on failure, 2 on wrong usage or parameters.
+    """Run a node until SIGINT or SIGTERM. Exit with 0, with 1 on failure, or with 2 on wrong usage or parameters.
 
-    With the process's own command line (``argv`` None), the process exits without interpreter shutdown.
+    If ``argv`` is None, the process's own command line is used and the process exits without interpreter shutdown.
     """
     status = run(node_class, argv)
     if argv is None:
@@ -107,8 +107,8 @@ def main(node_class: type[Node[Any]], argv: Sequence[str] | None = None) -> None
 def leave(status: int) -> NoReturn:
     """End the process at once, without interpreter shutdown.
 
-    Shutdown takes 0.7 s of CPU with numba's compiler loaded, and waits for threads that a library left running. The
-    node has already closed what matters (motors, bag, sockets, registry); the rest is memory.
+    Shutdown takes 0.7 s of CPU with numba's compiler loaded, and waits for threads that a library has left running. The
+    node has already closed its motors, bag, sockets and registry entries. Only memory is left to free.
     """
     logging.shutdown()
     for stream in (sys.stdout, sys.stderr):
@@ -118,19 +118,19 @@ def leave(status: int) -> NoReturn:
 
 
 class SafeFormatter(logging.Formatter):
-    """Formats log lines without control characters of strangers and without passwords."""
+    """Formats log lines without control characters and passwords."""
 
     def format(self, record: logging.LogRecord) -> str:
         return masked(visible(super().format(record)))
 
 
 def run(node_class: type[Node[Any]], argv: Sequence[str] | None = None) -> int:
-    """Like :func:`main`, but returns the exit status."""
+    """Run a node as :func:`main` does, but return the exit status."""
     args = argument_parser(node_class).parse_args(argv)
     handler = logging.StreamHandler(sys.stderr)
     text = f"%(asctime)s.%(msecs)03d %(levelname)-7s {args.name}: %(message)s"
     handler.setFormatter(SafeFormatter(text, datefmt="%Y-%m-%d %H:%M:%S"))
-    # Debug output of other packages would flood the node's own.
+    # Debug output of other packages would flood the node's log.
     logging.basicConfig(level=logging.INFO, handlers=[handler])
     log = logging.getLogger(args.name)
     for logger in (log, logging.getLogger("instant_ic")):
@@ -145,7 +145,7 @@ def run(node_class: type[Node[Any]], argv: Sequence[str] | None = None) -> int:
         return 2
     run_dir = args.run_dir or paths.run_dir()
     try:
-        registry.prepare(run_dir)  # before anything in it is trusted
+        registry.prepare(run_dir)  # checks the folder before any file in it is trusted
         pace.use(pace.read(run_dir))
         clock: Clock = ManualClock() if process.use_sim_time else SystemClock()
         transport = LocalTransport(run_dir, args.name, clock.now_ns, clock.steady_ns)
@@ -171,7 +171,7 @@ def run(node_class: type[Node[Any]], argv: Sequence[str] | None = None) -> int:
     except (NodeError, registry.RegistryError, MessageError) as error:
         log.error("%s", error)
         status = 1
-    except Exception:  # last resort: log the traceback; teardown still runs
+    except Exception:  # log the traceback as a last resort; teardown still runs
         log.exception("failed")
         status = 1
     finally:

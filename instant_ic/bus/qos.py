@@ -7,13 +7,13 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class QoS:
-    """How a topic is transported.
+    """Quality of service of a topic.
 
     Attributes:
         name: the preset's name, shown by ``ic topic info``.
-        depth: how many messages a reader keeps for a busy node; 1 means the newest of each publisher.
-        latched: a late joiner gets the last value.
-        reliable: a full queue is a fault that is counted and reported, not the normal way to skip messages.
+        depth: number of messages that a reader queues for a busy node; 1 keeps the newest of each publisher.
+        latched: send the last value to late joiners.
+        reliable: count and report messages dropped from a full queue as a fault; otherwise dropping is normal.
     """
 
     name: str
@@ -23,15 +23,15 @@ class QoS:
 
 
 SENSOR = QoS("sensor", depth=1)
-"""Newest only: a slow node works on the newest message, never on a queue of old ones."""
+"""Newest message only, so that a slow node never works on a queue of old messages."""
 
 RELIABLE = QoS("reliable", depth=1000, reliable=True)
-"""Every message in order; messages that do not fit into the queue are counted as lost."""
+"""Every message in order. Messages that do not fit into the queue are counted as lost."""
 
 LATCHED = QoS("latched", depth=16, latched=True, reliable=True)
 """The publisher keeps the last value and sends it to late joiners."""
 
 RECORD = QoS("record", depth=4000, reliable=True)
-"""For recorders: like ``reliable``, with a longer queue."""
+"""As ``reliable``, with a longer queue, for recorders."""
 
 PRESETS = {qos.name: qos for qos in (SENSOR, RELIABLE, LATCHED, RECORD)}

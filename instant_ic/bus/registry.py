@@ -5,8 +5,8 @@ Layout::
     RUN_DIR/topics/<topic, "/" as ".">/<node>.{sock,json,lock}
     RUN_DIR/nodes/<node>.{json,lock}
 
-A process holds its lock (``flock``) until it ends; the kernel releases it even after SIGKILL. A JSON file whose lock
-can be taken therefore belongs to a dead process and is removed.
+A process holds its lock (``flock``) until it ends. The kernel releases the lock even after SIGKILL. A JSON file whose
+lock can be taken therefore belongs to a dead process and is removed.
 """
 
 from __future__ import annotations
@@ -31,12 +31,12 @@ from instant_ic.util.private import make_folder
 
 _NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_]*\Z")
 _TOPIC = re.compile(r"(/[A-Za-z_][A-Za-z0-9_]*)+\Z")
-_FILE_TIME_STEP_NS = 50_000_000  # more than the kernel's
-_PREDECESSOR_S = 2.0  # how long a claim waits for a predecessor that is shutting down
-# The leftovers of a killed process change no folder. Every second its process is looked for, now and then its lock.
+_FILE_TIME_STEP_NS = 50_000_000  # more than the kernel's step
+_PREDECESSOR_S = 2.0  # time for which a claim waits for a predecessor that is shutting down
+# A killed process changes no folder, so processes are checked every second and locks less often.
 _LOOK_S = 1.0
 _FULL_LOOK_S = 5.0
-_MAX_IPC_PATH = 107  # sockaddr_un.sun_path less its final zero
+_MAX_IPC_PATH = 107  # bytes of sockaddr_un.sun_path without its final zero
 
 
 class RegistryError(RuntimeError):
@@ -104,8 +104,8 @@ def prepare(run_dir: Path) -> Path:
     """Create the run directory and its folders with mode 0700, or check that no other user can write to them.
 
     Raises:
-        RegistryError: the run directory cannot be created or written; it, or a folder in it, is a symbolic link or
-            belongs to another user; or other users can replace it because they can write to a folder above it.
+        RegistryError: the run directory cannot be created or written; the directory or a folder in it is a symbolic
+            link or belongs to another user; or other users can write to a folder above it and so replace it.
     """
     try:
         for folder in (run_dir, *(run_dir / name for name in ("topics", "nodes", "dev", "log"))):
@@ -131,8 +131,8 @@ def own_folder(folder: Path) -> None:
     """Create a folder with mode 0700, or check that an existing one belongs to this user, and set its mode.
 
     Raises:
-        RegistryError: it is a symbolic link or not a folder, or it belongs to another user.
-        OSError: it cannot be created.
+        RegistryError: the path is a symbolic link, is not a folder or belongs to another user.
+        OSError: the folder cannot be created.
     """
     with suppress(FileExistsError):
         make_folder(folder)
@@ -153,8 +153,8 @@ def open_lock(path: Path | str, create: bool = False) -> int:
     """Open a lock file and return its descriptor.
 
     Raises:
-        RegistryError: it is a symbolic link or not a regular file, or it belongs to another user.
-        OSError: it cannot be opened.
+        RegistryError: the path is a symbolic link, is not a regular file or belongs to another user.
+        OSError: the file cannot be opened.
     """
     flags = os.O_RDWR | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC | (os.O_CREAT if create else 0)
     try:
@@ -162,7 +162,7 @@ def open_lock(path: Path | str, create: bool = False) -> int:
     except OSError as error:
         if error.errno != errno.ELOOP:
             raise
-        raise RegistryError(f"{path} is a symbolic link: somebody else has put it there; remove it") from None
+        raise RegistryError(f"{path} is a symbolic link, which this program did not create: remove it") from None
     status = os.fstat(descriptor)
     if stat.S_ISREG(status.st_mode) and status.st_uid == os.getuid():
         return descriptor
@@ -179,7 +179,7 @@ class Claim:
     """A name in the registry, locked until it is released or the process ends.
 
     Args:
-        stem: path without suffix, for the ``.lock`` and the ``.json`` file.
+        stem: path of the ``.lock`` and the ``.json`` file without suffix.
         what: description for error messages.
 
     Raises:
@@ -199,11 +199,11 @@ class Claim:
             time.sleep(0.02)
 
     def _lock(self) -> bool:
-        """Try to lock the file at the path; False if the previous holder has removed the file just opened."""
+        """Try to lock the file at the path. Return False if the previous holder has removed the opened file."""
         try:
             own_folder(self.stem.parent)
             self._fd = open_lock(self._lock_path, create=True)
-        except FileNotFoundError:  # the empty folder was swept in between
+        except FileNotFoundError:  # the empty folder was removed in between
             return False
         except OSError as error:
             raise RegistryError(f"{self._what}: {error}") from error
@@ -216,7 +216,7 @@ class Claim:
         return False
 
     def write(self, content: dict[str, Any]) -> None:
-        """Replace the JSON file atomically; may be called from any thread.
+        """Replace the JSON file atomically. Any thread may call this.
 
         Raises:
             RegistryError: the disk is full, or the run directory is gone.
@@ -229,7 +229,7 @@ class Claim:
                 raise RegistryError(f"{self._what} cannot be registered: {error}") from error
 
     def release(self) -> None:
-        """Remove the JSON file and the lock; a second call does nothing."""
+        """Remove the JSON file and the lock. A second call does nothing."""
         if self._fd >= 0:
             self.json_path.unlink(missing_ok=True)
             self._lock_path.unlink(missing_ok=True)
@@ -238,10 +238,10 @@ class Claim:
 
 
 def check_socket_path(path: Path) -> Path:
-    """Return the path if a socket can be bound there.
+    """Return the path if it is short enough for a socket.
 
     Raises:
-        RegistryError: it is too long.
+        RegistryError: the path is too long.
     """
     if len(os.fsencode(path)) > _MAX_IPC_PATH:
         raise RegistryError(
@@ -251,7 +251,7 @@ def check_socket_path(path: Path) -> Path:
 
 
 def claim_socket(run_dir: Path, topic: str, node: str) -> tuple[Claim, Path]:
-    """Claim a publisher's name for a topic; returns the claim and a socket path that is free to bind.
+    """Claim a publisher's name for a topic. Return the claim and a socket path that is free to bind.
 
     Raises:
         RegistryError: the name is taken, or the path is too long for a socket.
@@ -264,7 +264,7 @@ def claim_socket(run_dir: Path, topic: str, node: str) -> tuple[Claim, Path]:
 
 
 def announce(claim: Claim, topic: str, type_name: str, qos: str, node: str, socket: Path, identity: bytes) -> None:
-    """Write the entry of a publisher whose socket is bound; readers find it from now on.
+    """Write the entry of a publisher whose socket is bound. Readers find the publisher from now on.
 
     Raises:
         RegistryError: the disk is full, or the run directory is gone.
@@ -295,7 +295,7 @@ def _alive(lock_path: Path | str) -> bool:
     """Return whether the owner of an entry holds its lock."""
     try:
         fd = open_lock(lock_path)
-    except (FileNotFoundError, RegistryError):  # another user's file is not an entry
+    except (FileNotFoundError, RegistryError):  # a file of another user is not an entry
         return False
     try:
         fcntl.flock(fd, fcntl.LOCK_SH | fcntl.LOCK_NB)
@@ -308,14 +308,14 @@ def _alive(lock_path: Path | str) -> bool:
 
 @functools.lru_cache(1024)
 def _content(path: str, written: tuple[int, int]) -> dict[str, Any]:
-    """Return the content of a JSON file, which is never changed after it was written."""
+    """Return the content of a JSON file. A written file is never changed, only replaced."""
     entry: dict[str, Any] = json.loads(Path(path).read_text())
     return entry
 
 
 def _entries(folder: Path | str) -> Iterator[dict[str, Any]]:
     try:
-        names = sorted(name for name in os.listdir(folder) if name.endswith(".json"))  # noqa: PTH208 - as below
+        names = sorted(name for name in os.listdir(folder) if name.endswith(".json"))  # noqa: PTH208 - faster, as below
     except FileNotFoundError:
         return
     for name in names:
@@ -323,9 +323,9 @@ def _entries(folder: Path | str) -> Iterator[dict[str, Any]]:
         if not _alive(f"{path.removesuffix('.json')}.lock"):
             continue
         try:
-            status = os.stat(path)  # noqa: PTH116 - for some hundred files a second
+            status = os.stat(path)  # noqa: PTH116 - faster, for some hundred files a second
             content = _content(path, (status.st_ino, status.st_mtime_ns))
-        except (OSError, ValueError):  # just removed, or the disk is full: try again at the next look
+        except (OSError, ValueError):  # just removed, or incomplete on a full disk; read again next time
             continue
         yield content
 
@@ -336,13 +336,13 @@ def topic_publishers(run_dir: Path, topic: str) -> list[PublisherInfo]:
 
 
 class TopicFolder:
-    """Live publishers of one topic, read again when its folder changes or a publisher's process has ended.
+    """Live publishers of one topic. They are read again when its folder changes or a publisher's process has ended.
 
     Args:
         folder: folder of the topic, see :func:`topic_dir`.
 
     Attributes:
-        publishers: those found at the last look.
+        publishers: publishers found at the last :meth:`read`.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -352,14 +352,14 @@ class TopicFolder:
         self._next_look_s = self._next_full_look_s = 0.0
 
     def look(self) -> bool:
-        """Read the entries if they may have changed; returns whether it did.
+        """Read the entries if they may have changed. Return whether they were read.
 
         Raises:
             OSError: the run directory is gone.
         """
         try:
-            mtime = os.stat(self._folder).st_mtime_ns  # noqa: PTH116 - five times a second for each topic
-        except FileNotFoundError:  # swept while it was empty; the next publisher makes it again
+            mtime = os.stat(self._folder).st_mtime_ns  # noqa: PTH116 - faster, five times a second per topic
+        except FileNotFoundError:  # removed while empty; the next publisher creates it again
             os.stat(os.path.dirname(self._folder))  # noqa: PTH116, PTH120
             mtime = 0
         now = time.monotonic()
@@ -379,19 +379,19 @@ class TopicFolder:
 
 
 class TopicWatch:
-    """Topics of a run directory, to be polled at low cost."""
+    """Topics of a run directory, which can be polled at low cost."""
 
     def __init__(self, run_dir: Path) -> None:
         self._root = run_dir / "topics"
         self._folders: dict[Path, TopicFolder] = {}
 
     def topics(self) -> list[TopicInfo]:
-        """Return the topics with a live publisher, by name."""
+        """Return the topics that have a live publisher, sorted by name."""
         paths = sorted(self._root.iterdir()) if self._root.is_dir() else []
         self._folders = {path: self._folders.get(path) or TopicFolder(path) for path in paths}
         found = []
         for path, folder in self._folders.items():
-            with suppress(OSError):  # just removed: the next call finds out
+            with suppress(OSError):  # just removed; the next call notices
                 folder.look()
             if publishers := folder.publishers:
                 found.append(TopicInfo("/" + path.name.replace(".", "/"), publishers[0].type_name, publishers))
@@ -399,7 +399,7 @@ class TopicWatch:
 
 
 def list_topics(run_dir: Path) -> list[TopicInfo]:
-    """Return the topics with a live publisher, by name."""
+    """Return the topics that have a live publisher, sorted by name."""
     return TopicWatch(run_dir).topics()
 
 
@@ -416,29 +416,30 @@ def _publisher(entry: dict[str, Any]) -> PublisherInfo:
 
 
 def settled(mtime_ns: int) -> bool:
-    """Return whether a folder with this time of change will show its next change by another time.
+    """Return whether the next change of a folder with this modification time will change that time.
 
-    The kernel's file times advance in steps of up to 10 ms: a change soon after a look leaves the time as it was.
+    The kernel's file times advance in steps of up to 10 ms, so two changes in one step have the same time.
     """
     return not -_FILE_TIME_STEP_NS < time.time_ns() - mtime_ns < _FILE_TIME_STEP_NS
 
 
 def running(publisher: PublisherInfo) -> bool:
-    """Return whether a publisher's process exists; cheaper than a look at its lock, but less certain."""
+    """Return whether a publisher's process exists. This is cheaper than testing its lock, but less certain."""
     try:
         os.kill(publisher.pid, 0)
     except ProcessLookupError:
         return False
-    except OSError:  # another user's process has the number
+    except OSError:  # a process of another user has this id
         return True
     return True
 
 
 def list_nodes(run_dir: Path) -> list[NodeInfo]:
-    """Return the live nodes, by name. Keys that this version does not know are ignored.
+    """Return the live nodes, sorted by name. Unknown keys of an entry are ignored.
 
     Raises:
-        RegistryError: an entry is incomplete, as of a node of another version. It could be a base: it is not skipped.
+        RegistryError: an entry is incomplete, for example of a node of another version. It is not skipped, because the
+            node could be a base.
     """
     known = {item.name for item in fields(NodeInfo)}
     found = []
@@ -449,25 +450,25 @@ def list_nodes(run_dir: Path) -> list[NodeInfo]:
             name, pid = entry.get("name", "?"), entry.get("pid", "?")
             raise RegistryError(
                 f"{run_dir / 'nodes'}: entry of node {name} (pid {pid}) is incomplete: stop that node, "
-                "it is of another version"
+                "which may be of another version"
             ) from error
     return found
 
 
 def sweep(run_dir: Path) -> int:
-    """Remove what dead processes left, and topics' empty folders; returns how many entries were removed."""
+    """Remove the entries of dead processes and the empty folders of topics. Return the number of entries removed."""
     swept = 0
     for lock_path in [*(run_dir / "topics").glob("*/*.lock"), *(run_dir / "nodes").glob("*.lock")]:
         try:
             fd = open_lock(lock_path)
-        except FileNotFoundError:  # its process has just ended
+        except FileNotFoundError:  # the process has just ended and removed it
             continue
         try:
             fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             continue
         else:
-            if not _is_at(fd, lock_path):  # its process has just ended, and another may have the name
+            if not _is_at(fd, lock_path):  # the process has just removed it, and another may have claimed the name
                 continue
             stem = lock_path.with_suffix("")
             leftovers = [p for s in (".json", ".sock") if (p := stem.with_name(stem.name + s)).exists()]

@@ -1,4 +1,4 @@
-"""The clock of a node that follows ``/clock``."""
+"""Clock of a node that follows ``/clock``."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _NO_CLOCK_S = 5.0
 
 
 class SimulatedTime:
-    """Sets a node's clock; a step back restarts its timers and drops its moving transforms."""
+    """Sets a node's clock. A step back restarts the node's timers and drops its moving transforms."""
 
     def __init__(self, node: NodeInterface, timers: Timers, transforms: NodeTransforms) -> None:
         assert isinstance(node.clock, ManualClock)
@@ -31,7 +31,7 @@ class SimulatedTime:
         self.subscription = node.subscribe("/clock", message_type("Clock"), self._on_clock, RELIABLE)
 
     def inputs(self) -> list[Subscription]:
-        """Return the subscriptions to read now; before simulated time has started, only ``/clock``."""
+        """Return the subscriptions to read now: only ``/clock`` before simulated time has started."""
         if self._clock.now_ns() > 0:
             if self._waited:
                 self._waited = False

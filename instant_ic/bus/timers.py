@@ -1,4 +1,4 @@
-"""Timers of a node, in the order of their times."""
+"""Timers of a node, ordered by the time at which they are due."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 @dataclass(eq=False)
 class Timer:
-    """A callback once per period."""
+    """A callback that runs once per period."""
 
     period_ns: int
     due_ns: int
@@ -18,12 +18,12 @@ class Timer:
     cancelled: bool = False
 
     def cancel(self) -> None:
-        """Stop the timer; it never fires again."""
+        """Stop the timer for good."""
         self.cancelled = True
 
 
 class Timers:
-    """The timers of one node; the caller supplies the time."""
+    """The timers of one node. The caller supplies the time."""
 
     def __init__(self) -> None:
         self._heap: list[tuple[int, int, Timer]] = []
@@ -34,7 +34,7 @@ class Timers:
         heapq.heappush(self._heap, (timer.due_ns, next(self._orders), timer))
 
     def next_ns(self) -> int | None:
-        """Return the time of the next timer."""
+        """Return the time at which the next timer is due; None without a timer."""
         while self._heap and self._heap[0][2].cancelled:
             heapq.heappop(self._heap)
         return self._heap[0][0] if self._heap else None
@@ -42,7 +42,7 @@ class Timers:
     def due(self, now_ns: int) -> Iterator[Timer]:
         """Yield the timers that are due, each once.
 
-        They stay on a fixed grid of periods: no drift, and no burst after a pause.
+        Timers stay on a fixed grid of periods, so they do not drift, and a pause does not cause a burst.
         """
         while (at_ns := self.next_ns()) is not None and at_ns <= now_ns:
             timer = heapq.heappop(self._heap)[2]

@@ -10,11 +10,11 @@ from instant_ic.bus.transport import Buffer, RawPublisher, RawSubscription, Rece
 from instant_ic.msg import MessageError, serializer, stamp_ns, type_name
 
 WENT_BACK_NS = 100_000_000
-"""A clock that goes back farther was set back or restarted; less is jitter."""
+"""Step back in time that counts as jitter. At a larger one, the clock was set back or restarted."""
 
 
 class Publisher:
-    """Typed publisher; :meth:`publish` may be called from any thread."""
+    """Typed publisher. Any thread may call :meth:`publish`."""
 
     def __init__(self, raw: RawPublisher) -> None:
         self.raw = raw
@@ -22,14 +22,14 @@ class Publisher:
 
     @property
     def subscriber_count(self) -> int:
-        """Number of connected readers; an image that nobody receives need not be made."""
+        """Number of connected readers. Without one, costly messages need not be made."""
         return self.raw.subscriber_count
 
     def publish(self, message: Any) -> None:
         """Send one message.
 
         Raises:
-            MessageError: the message is of another type, or a field has a wrong value.
+            MessageError: the message has another type, or a field has a wrong value.
         """
         if type_name(message) != self.raw.type_name:
             raise MessageError(f"{self.topic} carries {self.raw.type_name}, not {type_name(message)}")
@@ -39,8 +39,8 @@ class Publisher:
         """Send CDR bytes as they are.
 
         Args:
-            payload: must not be changed afterwards; it may still be on its way.
-            publish_ns: publication time of a forwarded message; default: now.
+            payload: CDR bytes; do not change them afterwards, because they may still be on their way.
+            publish_ns: publication time of a forwarded message; None uses the present time.
         """
         self.raw.send(payload, publish_ns)
 
@@ -55,16 +55,16 @@ class Subscription:
 
 
 class Latest:
-    """The newest message of a topic, as long as it is fresh."""
+    """The newest message of a topic while it is fresh."""
 
     def __init__(self, clock: Clock, max_age_s: float) -> None:
         self._clock = clock
         self.max_age_s = max_age_s
         self._message: Any = None
-        self._received_ns = 0  # on the steady clock, so that setting the machine's clock changes no age
+        self._received_ns = 0  # on the steady clock, so that ages do not change when the machine's clock is set
         self._given_ns = 0
         self.instances: dict[str, bytes] = {}
-        """Publishers by the name of their node, as in :class:`Received`."""
+        """Identities of publishers (:attr:`Received.instance`), by the name of their node."""
 
     def put(self, message: Any, received: Received) -> None:
         """Store a newer message with its reception data."""
@@ -73,23 +73,24 @@ class Latest:
         self._given_ns = received.given_ns(stamp_ns(message)) if hasattr(message, "header") else received.steady_ns
 
     def note(self, received: Received) -> None:
-        """Note the publisher of a message that is not stored."""
+        """Record the publisher of a message without storing the message."""
         self.instances[received.publisher] = received.instance
 
     def forget(self) -> None:
-        """Drop the message, as before the first."""
+        """Drop the message, as if none had arrived."""
         self._message = None
 
     @property
     def message(self) -> Any:
-        """The newest message, or None when there is none younger than ``max_age_s``."""
+        """The newest message, or None if it arrived more than ``max_age_s`` ago."""
         return self._message if self.age_s <= self.max_age_s else None
 
     @property
     def fresh(self) -> Any:
-        """The newest message, or None when it was measured or commanded more than ``max_age_s`` ago.
+        """The newest message, or None if it was measured or commanded more than ``max_age_s`` ago.
 
-        For inputs that a robot drives by: to ``message``, one that has waited for this node is newly arrived.
+        Use this for inputs by which a robot drives, because ``message`` treats a message that has waited for this node
+        as new.
         """
         return self._message if self.stamp_age_s <= self.max_age_s else None
 
@@ -100,12 +101,12 @@ class Latest:
 
     @property
     def stamp_age_s(self) -> float:
-        """Seconds since it was measured or commanded (:meth:`Received.given_ns`); inf before the first."""
+        """Seconds since the message was measured or commanded (:meth:`Received.given_ns`); inf before the first."""
         return self._since_s(self._given_ns)
 
     def _since_s(self, instant_ns: int) -> float:
         if self._message is None:
             return float("inf")
         age_ns = self._clock.steady_ns() - instant_ns
-        # From the future: the clock has been set back since, for example when a player restarts.
+        # A message from the future is stale: the clock was set back since, for example when a player restarted.
         return age_ns / 1e9 if age_ns >= -WENT_BACK_NS else float("inf")

@@ -1,4 +1,4 @@
-"""Interface between a node and its transport; implemented by the local and the lockstep bus."""
+"""Interface between a node and its transport, which the local and the lockstep bus implement."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ class TransportError(RuntimeError):
 class Received(NamedTuple):
     """One received message.
 
-    ``payload`` is read-only. A large one is a view of its publisher's memory; it does not change while anything refers
-    to it. A reader that keeps many messages gets copies.
+    ``payload`` is read-only. A large payload is a view of its publisher's memory and does not change while anything
+    refers to it. A reader that keeps many messages gets copies.
     """
 
     topic: str
@@ -29,16 +29,16 @@ class Received(NamedTuple):
     publish_ns: int
     received_ns: int
     order: int
-    """Position in order of arrival over all subscriptions of a node."""
+    """Position in the order of arrival over all subscriptions of a node."""
     publisher: str = ""
-    """Name of the node that published it."""
+    """Name of the node that published the message."""
     steady_ns: int = 0
-    """Time of arrival on the node's steady clock, for ages."""
+    """Time of arrival on the node's steady clock."""
     instance: bytes = b""
-    """Identity of the publisher; a node that is started again has another one. Empty: unknown."""
+    """Identity of the publisher, which changes when its node restarts. Empty if unknown."""
 
     def given_ns(self, stamp_ns: int) -> int:
-        """Return when the content was measured or commanded, on the node's steady clock; ages count from it.
+        """Return the time on the node's steady clock at which the content was measured or commanded.
 
         The stamp is compared with the machine's clock once, on arrival. After that only the steady clock counts, so
         setting the machine's clock changes no age. A stamp in the future counts as the time of arrival.
@@ -47,24 +47,24 @@ class Received(NamedTuple):
 
     @property
     def published_ns(self) -> int:
-        """Time on the node's steady clock when it was published: it may have waited for this node."""
+        """Time of publication on the node's steady clock, which may be long before the node reads the message."""
         return self.given_ns(self.publish_ns)
 
 
-_TOLERANCE_S = 0.1  # simulated time may go back a little
+_TOLERANCE_S = 0.1  # simulated time may go back by this much
 
 
 class Stats:
-    """Counts, rate, age and losses of one direction of a topic.
+    """Counts, rate, age and losses of one input or output.
 
-    Times are on the node's steady clock: setting the machine's clock changes no rate and no age.
+    Times are on the node's steady clock, so setting the machine's clock changes no rate and no age.
     """
 
     def __init__(self) -> None:
         self.count = 0
         self.lost_by: dict[str, int] = {}
         self.rejected = 0
-        self.rejected_why = ""  # of the newest one
+        self.rejected_why = ""  # reason of the newest rejection
         self.overwritten = 0
         self.newest_ns = 0
         self._arrivals: deque[int] = deque(maxlen=50)
@@ -75,7 +75,7 @@ class Stats:
         return sum(self.lost_by.values())
 
     def lose(self, publisher: str, count: int) -> None:
-        """Count messages that a publisher (named by its node) sent and that did not arrive."""
+        """Count messages of a publisher, given by its node's name, that did not arrive."""
         if count > 0:
             self.lost_by = {**self.lost_by, publisher: self.lost_by.get(publisher, 0) + count}
 
@@ -90,7 +90,7 @@ class Stats:
         recent = [t for t in list(self._arrivals) if 0 <= now_ns - t < 5_000_000_000]
         if len(recent) < 2 or recent[-1] <= recent[0]:
             return 0.0
-        # The time since the last message counts too: a topic that stopped must not keep its old rate.
+        # The time since the last message counts too, so that a topic that has stopped does not keep its old rate.
         span = max(recent[-1] - recent[0], (now_ns - recent[0]) * (len(recent) - 1) // len(recent))
         return (len(recent) - 1) * 1e9 / span
 
@@ -101,7 +101,7 @@ class Stats:
 
 
 class PublisherStats(Stats):
-    """Statistics of a publisher; ``not_shared`` counts large messages sent without shared memory, with the reason."""
+    """Statistics of a publisher; ``not_shared`` counts large messages that were sent without shared memory."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -120,11 +120,11 @@ class RawPublisher(Protocol):
     @property
     def subscriber_count(self) -> int: ...
     def send(self, payload: Buffer, publish_ns: int | None = None) -> None:
-        """Send one message; ``publish_ns`` keeps the publication time of a forwarded message."""
+        """Send one message; ``publish_ns`` is the publication time of a forwarded message."""
         ...
 
     def send_filled(self, size: int, fill: Callable[[memoryview], None], publish_ns: int | None = None) -> None:
-        """Send ``size`` bytes that ``fill`` writes straight into the memory that readers see."""
+        """Send ``size`` bytes that ``fill`` writes straight into the message's memory."""
         ...
 
     def close(self) -> None: ...
@@ -139,17 +139,17 @@ class RawSubscription(Protocol):
     stats: Stats
 
     def take(self) -> list[Received]:
-        """Return the messages since the last call, in order of arrival; with ``sensor``, the newest per publisher."""
+        """Return the messages since the last call, in order of arrival; at depth 1, the newest of each publisher."""
         ...
 
     def close(self) -> None: ...
 
 
 class Transport(Protocol):
-    """Topics of one node, and the event that its thread waits on; a wait may read the node's sockets.
+    """Topics of one node, and the event that its thread waits for. A wait may read the node's sockets.
 
     Attributes:
-        patient: messages do not end a wait of the node's thread; they are read when it ends.
+        patient: true if messages do not end a wait of the node's thread; they are read at its end.
     """
 
     patient: bool

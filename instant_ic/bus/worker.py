@@ -1,4 +1,4 @@
-"""Slow work beside a node's thread."""
+"""Worker thread for a node's slow work."""
 
 from __future__ import annotations
 
@@ -10,17 +10,17 @@ from instant_ic.bus.callbacks import Callbacks
 
 
 class Worker:
-    """Runs slow work in a thread beside the node's, on the newest item only.
+    """Runs slow work on a thread of its own, for the newest item only.
 
     Args:
-        callbacks: those of the node.
-        work: called with each item, on the worker's thread.
-        on_result: called with each result, on the node's thread.
-        inline: work in :meth:`submit` instead of in a thread (lockstep).
+        callbacks: callbacks of the node.
+        work: function called with each item, on the worker's thread.
+        on_result: function called with each result, on the node's thread.
+        inline: run the work in :meth:`submit` instead of on a thread, for lockstep.
 
     Attributes:
-        busy: an item is waiting or being worked on.
-        skipped: items that a newer one has replaced.
+        busy: true while an item is waiting or being worked on.
+        skipped: number of items that were replaced by newer ones.
     """
 
     def __init__(
@@ -44,7 +44,7 @@ class Worker:
             self._thread.start()
 
     def submit(self, item: Any) -> None:
-        """Hand over an item. It replaces an item that is still waiting, which is counted in ``skipped``."""
+        """Hand over an item. It replaces an item that is still waiting, which then counts as skipped."""
         if self._thread is None:
             self._do(item)
             return
@@ -54,7 +54,7 @@ class Worker:
             self._condition.notify()
 
     def stop(self, timeout_s: float = 3.0) -> None:
-        """End the thread after the current item; waits at most ``timeout_s``."""
+        """End the thread after the current item, and wait for it at most ``timeout_s``."""
         with self._condition:
             self._stopped = True
             self._item = []
@@ -77,7 +77,7 @@ class Worker:
     def _do(self, item: Any) -> None:
         try:
             result = self._work(item)
-        except Exception as error:  # noqa: BLE001 - a node survives a bad item; the fault is logged with its traceback
+        except Exception as error:  # noqa: BLE001 - a bad item must not end the node; the fault is logged with its traceback
             self._callbacks.call_soon(
                 self._callbacks.fault, f"background {getattr(self._work, '__name__', 'work')}", error
             )

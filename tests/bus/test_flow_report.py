@@ -46,7 +46,7 @@ def test_a_loss_during_the_drive_is_a_warning_with_its_cause_until_it_has_not_gr
     topic.stats.lose("vlp16_driver", 17)
     assert topic.at(10)[0] == OK
     topic.stats.lose("vlp16_driver", 3)
-    cause = "this node or the machine is too slow for them, see ic top"
+    cause = "this node or the machine is too slow, see ic top"
     assert topic.at(100) == (WARN, f"in the last 10 s messages lost (3 of vlp16_driver): {cause}")
     topic.stats.lose("grid_slam", 1)
     assert "(1 of grid_slam, 3 of vlp16_driver)" in topic.at(109)[1]

@@ -105,7 +105,7 @@ def test_reference_to_something_else_is_not_opened(stranger: Stranger, caplog) -
     pipe = os.pipe()
     header = HEADER.pack(SHARED, MARK, 1, 5, stranger.out.identity, type_digest(BYTES), 3)
     stranger.send(b"/x" + header, REFERENCE.pack(os.getpid(), pipe[0], 1, 1))
-    assert "shared memory of sender cannot be used (no shared memory of the bus)" in caplog.text
+    assert "shared memory of sender cannot be used (not shared memory of the bus)" in caplog.text
     assert stranger.reader.poll() == []
     for end in pipe:
         os.close(end)
