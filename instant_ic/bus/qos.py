@@ -32,6 +32,6 @@ LATCHED = QoS("latched", depth=16, latched=True, reliable=True)
 """The publisher keeps the last value and sends it to late joiners."""
 
 RECORD = QoS("record", depth=4000, reliable=True)
-"""As ``reliable``, with a longer queue, for recorders."""
+"""Every message in order with a longer queue, for recorders."""
 
 PRESETS = {qos.name: qos for qos in (SENSOR, RELIABLE, LATCHED, RECORD)}
