@@ -61,7 +61,7 @@ class Decision:
     """The command as used: zero when stale."""
     vbot_action: VbotAction
     vbot_target: NDArray[np.float64]
-    """(3,) pose that the v-bot moves to: the r-bot as it will be shown; for LED_BACK the r-bot itself."""
+    """(3,) goal of the v-bot: the r-bot's pose as the operator will see it; for LED_BACK the r-bot's present pose."""
     vbot_limit_m_s: float
     """Speed limit of the v-bot that follows from the rate of the views, in m/s."""
     hard: bool = False
@@ -75,7 +75,7 @@ class Decision:
 
 
 class Arbiter:
-    """Runs the transition table; pure: time comes in as ``now_ns``, everything else as ``ArbiterInputs``."""
+    """The state machine of illusory control. It reads no clock and no topic: only ``now_ns`` and ``ArbiterInputs``."""
 
     def __init__(self, config: ArbiterConfig | None = None) -> None:
         self.reconfigure(config or ArbiterConfig())
@@ -92,7 +92,7 @@ class Arbiter:
         self._no_view_fits = False  # the last entry was abandoned
         self._hard = False  # the last command was a hard stop
         self._yaw_gap_before = 0.0  # in the previous step
-        self._stopped_for_pose = False  # for a pose that has not been trusted since
+        self._stopped_for_pose = False  # stopped for a doubtful pose, which has not been trusted since
         self._poses_before: dict[str, tuple[NDArray[np.float64], int]] = {}  # previous pose and its time, by robot
         self._contradictions = 0  # number of contradictions that have stopped the robot
         self._stopped_by = Notice(Reason.STARTING, "The robot waits for its sensors.")
@@ -101,7 +101,7 @@ class Arbiter:
         self._interruptions = Interruptions()
         self._interrupted: Notice | None = None  # since the previous step
         self._vbot_start: NDArray[np.float64] = np.zeros(3)
-        self._passage: tuple[Notice | None, int] | None = None  # reason against a way round, and when it was found
+        self._passage: tuple[Notice | None, int] | None = None  # last result of find_passage, and its time
         self._actions: dict[str, Callable[[Snapshot, int], None]] = {
             "stop": self._stop,
             "call_vbot": _nothing,
@@ -113,7 +113,7 @@ class Arbiter:
         }
 
     def reconfigure(self, config: ArbiterConfig) -> None:
-        """Apply other parameters from the next step on; mode and history stay."""
+        """Apply new parameters from the next step on. Mode and history are kept."""
         predictor, rules = Predictor(config.prediction, config.limits, config.footprint), CommandRules(config)
         # From here on nothing fails: unusable values have raised above.
         self.config, self.predictor, self.rules = config, predictor, rules
@@ -131,13 +131,13 @@ class Arbiter:
         row = next((row for row in rows if GUARD_FUNCTIONS[row.guard](snapshot)), None)
         if row is not None:
             self._take(row, snapshot, now_ns)
-            # Prediction and gap are now those of another driven robot.
+            # Another robot is driven now: prediction and gap change.
             snapshot = self.assess(inputs, now_ns)
         self._yaw_gap_before = snapshot.yaw_gap_rad
         if self.mode == Mode.STOPPED:
             self._contradictions = inputs.contradictions
         sent = self.rules.command(snapshot, self._stopped_by)
-        # Letting go of the key during hard braking does not make it softer.
+        # Hard braking stays hard when the operator lets go of the key.
         self._hard = sent.twist == NO_MOTION and (self._hard or sent.hard)
         prediction = snapshot.prediction
         return Decision(
@@ -171,7 +171,7 @@ class Arbiter:
         return self._sources.stale_in_s(inputs, self.mode, *self._durations_s(now_ns))
 
     def _interruption(self, inputs: ArbiterInputs, now_ns: int) -> Notice | None:
-        """Note this step and its command; return why the controls must be released first."""
+        """Record this step and its command; return why the controls must be released before driving on, or None."""
         longest_s, operator = self.config.timeouts.stop_after_s, self._operator
         found = self._interruptions.step(now_ns, inputs.suspended_ns, inputs.instances, longest_s)
         if found is not None or self._interruptions.gap_s:
@@ -291,14 +291,14 @@ class Arbiter:
         return inputs.contradictions > self._contradictions
 
     def _vbot_jumps(self, pose: NDArray[np.float64], now_ns: int) -> bool:
-        """Return whether the v-bot's pose jumps, as ``_jumps``, while the r-bot follows it."""
+        """Return whether the v-bot's pose jumps while it is shown and the r-bot follows it."""
         if not self.mode.shows_vbot:
             self._poses_before.pop("v-bot", None)
             return False
         return self._jumps("v-bot", pose, now_ns)
 
     def _jumps(self, robot: str, pose: NDArray[np.float64] | None, now_ns: int) -> bool:
-        """Return whether a pose is not finite, or farther from the previous one than the robot can have driven."""
+        """Return whether a pose is not finite, or farther from the previous pose than the robot can have driven."""
         if pose is None:
             return False
         before, self._poses_before[robot] = self._poses_before.get(robot, (pose, now_ns)), (pose, now_ns)
@@ -312,7 +312,7 @@ class Arbiter:
         )
 
     def _durations_s(self, now_ns: int) -> tuple[float, float]:
-        """Return seconds since the last change of mode, and since the v-bot has been shown."""
+        """Return the seconds since the last change of mode, and the seconds for which the v-bot has been shown."""
         return self._since_s(self._since_ns, now_ns, 0.0), self._since_s(self._shown_since_ns, now_ns, 0.0)
 
     @staticmethod
@@ -320,7 +320,7 @@ class Arbiter:
         return otherwise_s if since_ns is None else (now_ns - since_ns) / 1e9
 
     def _vspace(self, inputs: ArbiterInputs, now_ns: int) -> Vspace:
-        """Return the status of the virtual space; for a short time that of its last ready keyframe while it learns."""
+        """Return the status of the virtual space. While it learns, its last ready status is kept for a short time."""
         now = inputs.vspace
         if now.ready or not now.training or self._ready is None:
             return now
@@ -364,7 +364,7 @@ class Arbiter:
         return s.agree_s < 0.0 and abs(linear) < STANDS_M_S and abs(angular) < STANDS_RAD_S
 
     def _against_switch(self, s: Snapshot, now_ns: int) -> Notice | None:
-        """Return the reason against a switch in REAL with an obstacle ahead; None without one."""
+        """Return why no switch is possible in REAL with an obstacle ahead; None if one is, or no obstacle is ahead."""
         if s.mode != Mode.REAL or not s.obstacle_ahead:
             return None
         if estop_pressed(s):
@@ -372,7 +372,7 @@ class Arbiter:
         return hold(s) or against_switch(s) or self._blocked_passage(s, now_ns)
 
     def _blocked_passage(self, s: Snapshot, now_ns: int) -> Notice | None:
-        """Return the reason why there is no way round the obstacle ahead; None when there is one.
+        """Return why there is no way round the obstacle ahead; None if there is a way.
 
         Planning takes milliseconds, so the answer is kept for a costmap's period.
         """
@@ -413,5 +413,5 @@ def _vbot_action(s: Snapshot) -> VbotAction:
     if s.mode != Mode.VIRTUAL:
         return VbotAction.WITH_ROBOT
     if s.settles or any(stale.source.key in ("view", "command") for stale in s.stale):
-        return VbotAction.HELD  # the operator does not see it, or does not drive it
+        return VbotAction.HELD  # the operator does not see or does not drive the v-bot
     return VbotAction.LED_BACK if s.leading_back else VbotAction.DRIVEN

@@ -15,7 +15,7 @@ from instant_ic.control.prediction import PredictionConfig, stopping_distance
 from instant_ic.control.safety import CollisionMonitorConfig
 
 MOST_BLIND_M = 1.0
-"""Longest way at full speed until a source that is lost stops the robot."""
+"""Longest distance driven at full speed before a lost source stops the robot."""
 
 
 @dataclass(frozen=True)
@@ -30,20 +30,21 @@ class SwitchConfig(Checked):
         return_patience_s: seconds of agreement after which the return begins from any remaining distance.
         picture_position_m: largest position error between view and camera image at a switch, in metres.
         picture_yaw_deg: largest heading error at a switch, in degrees.
-        return_picture_m: as picture_position_m, at the return, where the v-bot is eased until the page has switched.
+        return_picture_m: as picture_position_m, for the return; smaller, because the v-bot is eased onto the r-bot.
         return_picture_yaw_deg: as picture_yaw_deg, at the return.
         return_turn_rad_s: rad/s; no return to the camera while the r-bot turns faster: its heading estimate lags.
-        enter_timeout_s: seconds in which the r-bot slows to a stand while no view fits. The arbiter then waits for an
+        enter_timeout_s: seconds over which the r-bot slows to a stop while no view fits. The arbiter then waits for an
             image and a view of that place.
-        return_timeout_s: seconds after which the return ends although view and image (too rare) do not match.
+        return_timeout_s: seconds after which the return ends even if view and image are too rare to match.
         min_virtual_s: shortest stay in the virtual space, in seconds.
         min_real_s: seconds between a return, or an abandoned entry, and the next entry.
         return_margin_m: length in metres that must be free beyond the horizon that triggers an entry.
-        neutral_return_s: seconds of hands off after which the real view returns even before an obstacle.
-        lead_back_after_s: seconds of hands off after which the v-bot goes back to an r-bot that cannot come; 0: never.
+        neutral_return_s: seconds without a command after which the camera image returns even in front of an obstacle.
+        lead_back_after_s: seconds without a command after which the v-bot goes back to an r-bot that cannot follow; 0:
+            never.
         stop_margin_m: distance in metres kept to an obstacle when no switch is possible.
-        min_expected_psnr_db: expected quality in dB that a view of the robot's place needs; 0: not checked.
-        ready_hold_s: seconds for which a virtual space that learns its next keyframe counts as ready with the last one.
+        min_expected_psnr_db: smallest expected quality in dB of a view at the robot's place; 0: not checked.
+        ready_hold_s: seconds for which the virtual space still counts as ready while it learns its next keyframe.
     """
 
     position_m: Annotated[float, Plausible(0.01, 1)] = 0.15
@@ -76,8 +77,8 @@ class PoseTrustConfig:
         slow: probability of being lost from which the r-bot drives slowly and does not switch.
         stop: probability of being lost from which the r-bot stops, until the operator lets go of the controls.
         speed_m_s: speed limit in m/s from ``slow`` on.
-        jump_m: m; a jump of the pose by more than this, and than the robot can have driven meanwhile, stops the r-bot
-            as a lost pose does: it was carried off, or its pose was wrong.
+        jump_m: m; a pose that jumps by this much more than the robot can have driven stops the r-bot as a lost pose
+            does: the robot was carried off, or its pose was wrong.
         jump_deg: degrees; as jump_m, for the heading.
     """
 
@@ -99,10 +100,10 @@ class ArbiterConfig(Checked):
 
     Attributes:
         collision_monitor: last step before /cmd_vel; the most restrictive polygon wins.
-        timeouts: s; with an older message the command is zero. Images (camera, view): late_s after their usual arrival,
-            if longer.
+        timeouts: s; the command is zero when a message is older. For images (camera, view): late_s after their usual
+            arrival, if that is later.
         rate_hz: steps of the state machine and messages on /cmd_vel, per second; while the robot rests, at most 10.
-        unprotected: allows that the polygons stop and approach, the blind radius, the memory or the 3D points are off,
+        unprotected: allow switching off the polygons stop and approach, the blind radius, the memory or the 3D points,
             with a permanent warning.
     """
 

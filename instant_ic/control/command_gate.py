@@ -6,9 +6,9 @@ A command passes if
 2. its sender has the right to drive (:class:`~instant_ic.control.robot_lease.Lease`), where the gate has a lease;
 3. it is recent: neither too old, nor stamped ahead of the receiver's clock, nor without a stamp.
 
-Each receiver adds checks of its own. The console has an explicit driver, the page that took control, and numbered
-commands. The base obeys one node by its name. The arbiter accepts an old command of the driver: it watches the age of
-the command, and stops the robot by it.
+Each receiver adds checks of its own. The console accepts numbered commands of one driver, the page that took control.
+The base obeys one node by its name. The arbiter accepts an old command of the driver, because it watches the command's
+age itself and stops the robot when the command is stale.
 """
 
 from __future__ import annotations
@@ -40,11 +40,11 @@ class GateLimits:
 
 
 class CommandGate:
-    """Checks whether a command may drive; independent of bus and clock.
+    """The check whether a command may drive; independent of bus and clock.
 
     Args:
         limits: limits of the commands.
-        lease: who drives; None: the caller knows its sender.
+        lease: lease of the right to drive; None: the caller decides by itself who drives.
 
     Attributes:
         refused: number of refused commands by verdict.
@@ -71,7 +71,7 @@ class CommandGate:
         return None
 
     def check_age(self, age_s: float | None) -> Refusal | None:
-        """Check the age of a command in seconds, by its stamp; None: it has no stamp."""
+        """Check the age of a command by its stamp, in seconds; None for a command without a stamp."""
         limits = self.limits
         if age_s is None:
             return None if limits.accept_unstamped else self.refuse(Verdict.UNSTAMPED, "command has no stamp")
@@ -94,7 +94,7 @@ class CommandGate:
         given_ns: int | None = None,
         stands: bool = True,
     ) -> Refusal | None:
-        """Check a command; return why it must not drive, or None. A command that passes prolongs its sender's lease.
+        """Check a command; return why it must not drive, or None. An accepted command prolongs its sender's lease.
 
         Args:
             v: speed in m/s.
@@ -102,14 +102,14 @@ class CommandGate:
             age_s: age in seconds by its stamp; None without a stamp.
             sender: name of the sender.
             now_ns: steady time.
-            given_ns: steady time of the command, from which the lease runs; ``now_ns`` if None.
-            stands: whether the robot stands; only then does the lease pass to another sender.
+            given_ns: steady time at which the command was given, the start of the lease; ``now_ns`` if None.
+            stands: whether the robot stands; the lease passes to another sender only then.
         """
         if (refusal := self.check_twist(v, w)) is not None:
             return refusal
         if self.lease is None:
             return self.check_age(age_s)
-        # The lease comes before the age: an old command also shows that a control is held.
+        # The lease is checked first, because an old command also shows that a control is held.
         denied = self.lease.refusal(sender, (v, w) != (0.0, 0.0), now_ns, stands)
         if (refusal := self.check_age(age_s)) is not None:
             return refusal

@@ -29,11 +29,11 @@ class DriveCommand:
     blocked: bool = False
     """An obstacle limits the operator's command."""
     hard: bool = False
-    """If the command is zero, it has another cause than the operator: the base must brake hard."""
+    """A zero command has another cause than the operator: the base must brake hard."""
 
 
 class CommandRules:
-    """Turns a snapshot into a command; holds no state."""
+    """The rules that turn a snapshot into a command, without state."""
 
     def __init__(self, config: ArbiterConfig) -> None:
         self.config = config
@@ -93,7 +93,7 @@ class CommandRules:
         if s.mode == Mode.ENTERING:
             notice = Notice(Reason.SWITCHING_TO_VIRTUAL, "Obstacle ahead. Switching to the virtual space.")
             waited = s.in_mode_s / self.config.switch.enter_timeout_s
-            left = max(0.0, 1.0 - waited**2)  # hardly noticed if the view comes in time
+            left = max(0.0, 1.0 - waited**2)  # slows late: hardly noticed if the view comes in time
             command = (command[0] * left, command[1] * left)
         elif s.mode == Mode.RETURNING:
             notice = Notice(Reason.SWITCHING_TO_CAMERA, "You drive the robot. Switching back to the camera.")
@@ -114,7 +114,7 @@ class CommandRules:
         return DriveCommand(sent.command, notice, blocked, hard=not s.fresh or sent.action == "stop")
 
     def monitored(self, command: Twist2, inputs: ArbiterInputs) -> MonitoredCommand:
-        """Return the command after the collision monitor, which gets all points seen and remembered near the robot."""
+        """Return the command after the collision monitor, which checks all seen and remembered points nearby."""
         points = inputs.scan_points
         if command != NO_MOTION and inputs.costmap is not None and inputs.robot_pose is not None:
             config = self.config.collision_monitor
@@ -126,14 +126,14 @@ class CommandRules:
     def _slowed(self, command: Twist2, distance_m: float, reach_m: float) -> Twist2:
         """Return the command slowed so that the robot can stop ``stop_margin_m`` before the obstacle."""
         left = max(0.0, distance_m - self.config.switch.stop_margin_m)
-        # Half of the base's deceleration; the other half covers the latency.
+        # This assumes half of the base's deceleration; the other half covers the latency.
         allowed = math.sqrt(self.config.limits.max_linear_accel_m_s2 * left)
         speed = abs(command[0]) + reach_m * abs(command[1])
         factor = min(1.0, allowed / speed) if speed > 0 else 1.0
         return command[0] * factor, command[1] * factor
 
     def _paced(self, command: Twist2, s: Snapshot) -> Twist2:
-        """Return the command slowed to what the image rate and the trust in the pose allow, with the same curvature."""
+        """Return the command at the speed that image rate and trust in the pose allow, with the same curvature."""
         limit = self.sources.speed_limit_m_s(s.inputs, s.mode)
         if s.must_be_slow:
             limit = min(limit, self.config.pose_trust.speed_m_s)
@@ -142,7 +142,7 @@ class CommandRules:
 
 
 def why_stopped(s: Snapshot, stopped_by: Notice) -> Notice:
-    """Return the reason that keeps the robot in STOPPED, to which ``stopped_by`` led."""
+    """Return the reason that keeps the robot in STOPPED; ``stopped_by`` is the reason of the stop."""
     inputs = s.inputs
     if inputs.estop_button:
         text = "The robot's emergency stop button is pressed. Release it, then release the stop here."

@@ -27,7 +27,7 @@ UNKNOWN = 255
 _LOOKED = 1
 """Mark of a cell that a beam of the scan passed through."""
 SLACK_M = 1e-6
-"""Tolerance of comparisons of distances: five cells of 0.05 m are not quite 0.25 m in floating point."""
+"""Tolerance when distances are compared: five cells of 0.05 m are not quite 0.25 m in floating point."""
 
 
 @dataclass(frozen=True)
@@ -37,16 +37,16 @@ class CostmapConfig:
     Attributes:
         width: m; side of the window that moves with the robot.
         resolution: m per cell.
-        update_frequency: per second; upper limit: each update adds a new scan or new points.
+        update_frequency: largest number of updates per second; an update needs a new scan or new points.
         publish_frequency: messages on /costmap, per second.
         inflation_radius: m; costs reach this far from an obstacle.
         cost_scaling_factor: 1/m; higher: costs fall off faster, paths come closer to obstacles.
         obstacle_max_range: m; farther hits are not marked.
         raytrace_max_range: m; beams clear no farther than this.
-        footprint_clearing_enabled: the cells under the robot are free.
-        static_seen_through: consecutive scans that must look through a cell that only the map holds, until it counts as
-            free; 0: never.
-        points: low and hanging things, from /lidar/points.
+        footprint_clearing_enabled: clear the cells under the robot.
+        static_seen_through: number of consecutive scans that must look through a cell before it counts as free although
+            the map holds it as occupied; 0: never.
+        points: obstacles from /lidar/points, such as low and hanging things.
     """
 
     width: Annotated[float, Plausible(2, 100)] = 12.0
@@ -80,7 +80,7 @@ class Costmap:
     """(N, 2) centres of the cells that 3D points marked: low and hanging things that the flat scan does not see."""
 
     def cells(self, points: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Return the row and column of points (..., 2); not checked against the window."""
+        """Return the rows and columns of points (..., 2), which may lie outside the window."""
         index = np.floor((np.asarray(points, dtype=np.float64) - self.origin) / self.resolution).astype(np.int64)
         return index[..., 1], index[..., 0]
 
@@ -125,8 +125,9 @@ class Costmap:
     def memory_near(
         self, pose: NDArray[np.float64], blind_radius_m: float, remembered_radius_m: float
     ) -> NDArray[np.float64]:
-        """Return marks that no sensor may see at present, (N, 2) in the frame of ``pose``: lethal cells in the
-        blind zone round the LiDAR, and farther out the marks of 3D points.
+        """Return the marks that the sensors may not see at present, (N, 2) in the frame of ``pose``.
+
+        These are the lethal cells in the blind zone round the LiDAR, and the marks of 3D points farther out.
         """
         away = self.remembered - np.asarray(pose)[:2]
         away = away[(away**2).sum(axis=-1) <= remembered_radius_m**2]
@@ -139,7 +140,7 @@ class Costmap:
 
     @staticmethod
     def from_occupancy(occupancy: NDArray[np.int8], resolution: float, origin: NDArray[np.float64]) -> Costmap:
-        """Return the inverse of ``occupancy``; inflated costs are exact to 1.3."""
+        """Return the costmap of a published grid, the inverse of ``occupancy``; inflated costs are exact to 1.3."""
         costs = _FROM_OCCUPANCY[np.asarray(occupancy, dtype=np.int8).view(np.uint8)]
         return Costmap(costs, float(resolution), np.asarray(origin, dtype=np.float64)[:2])
 
@@ -169,7 +170,7 @@ class ScanRays:
     ends: NDArray[np.float64]
     """(N, 2) end of each beam."""
     hits: NDArray[np.bool_]
-    """(N,) whether the beam ended on something near enough to be marked."""
+    """(N,) true where the beam ended on something near enough to be marked."""
 
 
 def scan_points(
@@ -193,7 +194,7 @@ def scan_rays(
 ) -> ScanRays:
     """Return the measured beams of a scan in the map frame (REP-117).
 
-    A beam without a return neither marks nor clears: a VLP-16 returns nothing from nearer than 0.4 m either.
+    A beam without a return neither marks nor clears, because a VLP-16 also returns nothing from nearer than 0.4 m.
     ``ranges`` is (N,) in metres, angles are radians; ``map_from_lidar`` is (4, 4) at the stamp of the scan.
     """
     r = np.asarray(ranges, dtype=np.float64)
@@ -215,31 +216,31 @@ class RollingCostmap:
         self.size = round(config.width / config.resolution)
         self.heights = HeightLayer(config.points, self.size, config.resolution)
         self._observed = np.full((self.size, self.size), UNKNOWN, dtype=np.uint8)
-        # Consecutive scans that looked through a cell, saturating; a hit in the cell or beside it restarts the count.
+        # Number of consecutive scans that looked through a cell, at most 255; a hit in or beside it resets the count.
         self._through = np.zeros((self.size, self.size), dtype=np.uint8)
         self._corner: tuple[int, int] | None = None  # first column and row of the window in the endless grid
         self._body = footprint.points(0.5 * config.resolution)
-        # Marks of 3D points may never be seen again from near: a pose that is a cell off must not erase them.
+        # From near, the sensors may never see these marks again: a pose that is a cell off must not erase them.
         self._under = footprint.points(0.5 * config.resolution, -config.resolution)
-        # Squared distances between cells are whole numbers: the cost of each, up to the inflation radius.
+        # Squared distances between cells are whole numbers, so the costs up to the inflation radius fit a table.
         reach = (max(config.inflation_radius, footprint.inscribed_radius_m) + SLACK_M) / config.resolution
         metres = np.sqrt(np.arange(math.floor(reach**2) + 1)) * config.resolution
         self._cost_of_square = np.array([inflated_cost(d, config, footprint) for d in metres], dtype=np.uint8)
 
     def reset(self) -> None:
-        """Forget all observations, as after a jump of the map."""
+        """Forget all observations, for example after a jump of the map."""
         self._observed.fill(UNKNOWN)
         self._through.fill(0)
         self.heights.reset()
 
     def carry(self, moved: NDArray[np.float64]) -> None:
-        """Move all observations by ``moved`` (x, y, yaw), as after a correction of the map."""
+        """Move all observations by ``moved`` (x, y, yaw), for example after a correction of the map."""
         if self._corner is None:
             return
         corner, c, s = np.array(self._corner), math.cos(moved[2]), math.sin(moved[2])
 
         def carried(mask: NDArray[np.bool_]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-            """Return the rows and columns (2, N) of the cells in ``mask``, and where they go."""
+            """Return the rows and columns (2, N) of the cells in ``mask``, and of the cells that they move to."""
             cells = np.argwhere(mask)
             places = (cells[:, ::-1] + corner + 0.5) @ np.array([[c, s], [-s, c]]) + moved[:2] / self.config.resolution
             goals = np.floor(places).astype(np.intp)[:, ::-1] - corner[::-1]
@@ -263,7 +264,7 @@ class RollingCostmap:
     ) -> Costmap:
         """Move the window over the robot (x, y, yaw), add a scan and a sweep of points, and return the costs.
 
-        ``map_from_points`` (x, y, yaw) places the frame of the points in the map; None: it is the map frame.
+        ``map_from_points`` (x, y, yaw) is the pose of the points' frame in the map; None: they are in the map frame.
         """
         resolution = self.config.resolution
         self._move_to(float(robot_pose[0]), float(robot_pose[1]))
@@ -316,16 +317,16 @@ class RollingCostmap:
             layer[index[:, 1], index[:, 0]] = value
 
     def _master(self, static: StaticMap | None, origin: NDArray[np.float64]) -> NDArray[np.uint8]:
-        """Join the layers like nav2's ``combination_method`` max: a cell is occupied if any layer says so.
+        """Join the layers like nav2's ``combination_method`` max: a cell is occupied if any layer marks it.
 
-        Exception: a cell that only the map holds and that ``static_seen_through`` consecutive scans have looked through
-        is free. It is a ghost of a misplaced scan, or a thing that has been removed.
+        Exception: a cell that only the map marks is free once ``static_seen_through`` consecutive scans have looked
+        through it. It stems from a misplaced scan, or from a thing that has been removed.
         """
         occupancy, shift = np.full((1, 1), -1, dtype=np.int8), np.zeros(2)
         resolution = self.config.resolution
         if static is not None:
             occupancy, resolution, shift = static.occupancy.view(), static.resolution, origin - static.origin
-        occupancy.flags.writeable = False  # numba would compile the kernel once more for a map that may be written
+        occupancy.flags.writeable = False  # one array type: numba compiles the kernel once
         return _join(
             self._observed,
             self.heights.occupied(),
@@ -374,7 +375,7 @@ def _join(
     through: NDArray[np.uint8],
     seen_through: int,
 ) -> NDArray[np.uint8]:
-    """Return the master grid of observations and map, whose origin lies ``shift`` metres before the window's."""
+    """Return the master grid of observations and map; the map's origin lies ``shift`` metres before the window's."""
     size_y, size_x = observed.shape
     height, width = occupancy.shape
     master = np.empty_like(observed)
@@ -400,7 +401,7 @@ def _join(
 
 @njit(cache=True)
 def _inflate(master: NDArray[np.uint8], distance: NDArray[np.float32], cost_of_square: NDArray[np.uint8]) -> None:
-    """Write the cost for each cell's distance (cells) to the nearest lethal one; unknown cells only if inscribed."""
+    """Write each cell's cost by its distance to the nearest lethal one, in cells; unknown cells only if inscribed."""
     most = math.sqrt(len(cost_of_square) - 0.5)
     for r in range(master.shape[0]):
         for c in range(master.shape[1]):
@@ -420,10 +421,10 @@ def _clear_and_mark(
     ends: NDArray[np.float64],
     hits: NDArray[np.bool_],
 ) -> None:
-    """Clear along every beam up to its last cell, then mark the hits: a hit outlives a grazing beam.
+    """Clear along every beam up to its last cell, then mark the hits, so that no grazing beam clears a hit.
 
-    ``looked`` receives what this scan saw: ``_LOOKED`` where a beam passed, 254 for a hit. Coordinates are in cells of
-    ``observed``. The loop visits the cells that a beam touches (Amanatides & Woo 1987).
+    ``looked`` receives the cells of this scan: ``_LOOKED`` where a beam passed, 254 for a hit. Coordinates are in cells
+    of ``observed``. The loop visits the cells that a beam touches (Amanatides & Woo 1987).
     """
     height, width = observed.shape
     for i in range(ends.shape[0]):

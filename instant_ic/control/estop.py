@@ -1,4 +1,4 @@
-"""Latch of the emergency stop: one rule for every node that obeys it."""
+"""Latch of the emergency stop, shared by every node that obeys it."""
 
 from __future__ import annotations
 
@@ -10,23 +10,23 @@ from instant_ic.util import estop_state
 from instant_ic.util.diagnosis import Diagnosis, Level
 
 FUTURE_NS = 500_000_000
-"""A release stamped farther ahead than this was published before the clock was set back."""
+"""A release stamped farther ahead than this is refused: it was published before the clock was set back."""
 OLD_NS = 3_000_000_000
-"""An older message is a latched value that is repeated, as after a restart of a bridge: no new action."""
+"""An older message is no new action, but a latched value that was sent again, for example after a bridge restarted."""
 
 
 @dataclass
 class EstopLatch:
-    """Emergency stop that any client sets at once and only a newer release ends.
+    """An emergency stop that any client sets at once, and that only a newer release ends.
 
-    Each client has a latched value of its own. After a restart these values arrive in any order, so an old release of
-    one client must not end the stop of another: a press always counts, a release only if it is newer than the press.
+    Each client has a latched value of its own. After a restart these values arrive in any order, and an old release of
+    one client must not end the stop of another. So a press always counts; a release counts only if it is newer.
 
     Attributes:
         pressed: a press has not been released yet.
         publisher: name of the node that pressed last.
         pressed_ns: publication time of that press, nanoseconds since the epoch.
-        again: the press was a repeated latched value; a newer repeated release then ends it.
+        again: the press was an old latched value sent again. A newer release sent again then ends the stop.
         buttons: names of the nodes that report a pressed button on the robot.
     """
 
@@ -38,7 +38,7 @@ class EstopLatch:
 
     @property
     def button(self) -> bool:
-        """True if a button on the robot is pressed; no release counts until it is released."""
+        """True if a button on the robot is pressed. Until the button is released, every release is refused."""
         return bool(self.buttons)
 
     @property
@@ -55,14 +55,14 @@ class EstopLatch:
         return Diagnosis("emergency stop", Level.WARN, f"Latched by {by}. Release it on the operator's page")
 
     def hear(self, pressed: bool, publisher: str, publish_ns: int, received_ns: int, holder: str | None = None) -> str:
-        """Take a message of ``/operator/estop``.
+        """Handle a message of ``/operator/estop``.
 
         Args:
-            pressed: its value.
+            pressed: value of the message.
             publisher: name of the node that published it.
-            publish_ns: when it was published, nanoseconds since the epoch.
-            received_ns: when it arrived, by this machine's clock.
-            holder: who has the robot's lease, and alone may release; empty: nobody; None: not known here.
+            publish_ns: time of publication in nanoseconds since the epoch.
+            received_ns: time of arrival by this machine's clock, in the same unit.
+            holder: holder of the robot's lease, who alone may release; empty: nobody; None: not known here.
 
         Returns:
             Why a release is refused; empty if the message was obeyed.
@@ -92,7 +92,7 @@ class EstopLatch:
         return ""
 
     def hear_button(self, pressed: bool, publisher: str, publish_ns: int) -> None:
-        """Take a message of ``/robot/estop``: a press latches, releasing the button ends nothing by itself."""
+        """Handle a message of ``/robot/estop``. A press latches; releasing the button alone does not end the stop."""
         if pressed:
             self.buttons.add(publisher)
             self.again = False
@@ -101,26 +101,27 @@ class EstopLatch:
             self.buttons.discard(publisher)
 
     def _press(self, publisher: str, publish_ns: int) -> None:
-        # Compare only times of one publisher, even if its clock was set back: its stop and release belong together.
+        # A publisher's newest press replaces its earlier one even if its clock was set back, so that its own release,
+        # stamped by the same clock, is newer than the press.
         same = publisher == self.publisher
         self.pressed_ns = publish_ns if same else max(publish_ns, self.pressed_ns)
         self.pressed, self.publisher = True, publisher
 
 
 class KeptEstop(EstopLatch):
-    """A latch that survives a restart: of the node, of the stack, and of the machine (``estop_state``).
+    """A latch that survives a restart of the node, the stack and the machine (``estop_state``).
 
     Attributes:
-        why: text for the operator of a stop that nobody pressed in this run; empty otherwise.
+        why: text for the operator about a stop that was not pressed in this run; empty otherwise.
     """
 
     def __init__(self, run_dir: Path | None, now_ns: int) -> None:
-        """Start stopped if the emergency stop was pressed when the last run ended, or that run broke off."""
+        """Start stopped if the emergency stop was pressed when the last run ended, or if that run was cut off."""
         super().__init__()
         self._run_dir = run_dir
         self._kept = None if run_dir is None else estop_state.read(run_dir)
         if self._kept is not None:
-            # Only releases from now on count: if the clock was set, an old one may look newer than the press.
+            # Only releases from now on count: after a change of the clock, an old release may look newer than the stop.
             self._kept = replace(self._kept, pressed_ns=now_ns)
             self.hear(True, self._kept.publisher, self._kept.pressed_ns, now_ns)
 

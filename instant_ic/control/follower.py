@@ -24,13 +24,13 @@ from instant_ic.geometry.poses import relative2, wrap_angle
 LOOKAHEAD_TIME_S = 1.0
 """Distance of the carrot, in seconds at the present speed."""
 SCALING_MIN_RADIUS_M, SCALING_MIN_SPEED_M_S = 0.60, 0.05
-"""The robot is slower in curves tighter than the radius, but not slower than the speed."""
+"""The robot slows down in curves tighter than this radius, down to this speed."""
 ROTATE_MIN_RAD, ROTATE_STOP_RAD = 0.8, 0.15
 """Bearings of the carrot above which the robot turns on the spot, and below which it drives on."""
 ROTATE_GAIN = 2.0
 """Turn rate per radian of bearing, 1/s."""
 APPROACH_DECEL_M_S2 = 0.4
-"""Deceleration before the end of the path."""
+"""Deceleration towards the end of the path."""
 CHECKED_S = 1.0
 """Seconds of the arc to the carrot that are checked for collisions."""
 PADDING_M = 0.01
@@ -38,15 +38,15 @@ PADDING_M = 0.01
 GOAL_M, GOAL_RAD = 0.05, 0.05
 """Tolerance at the goal: well inside ``switch.position_m`` and ``switch.yaw_deg``."""
 TRACK_DISTANCE_M = 0.6
-"""Nearer than this to a moving v-bot, its own speed is followed."""
+"""Nearer to a moving v-bot than this, the r-bot follows the v-bot's own speed."""
 BESIDE_M = 0.3
-"""A moving goal nearer than this may be tracked off the path, if the straight way to it is free."""
+"""A moving goal nearer than this may be tracked off the path if the straight way to it is free."""
 STANDS_BELOW = 0.05
 """m/s or rad/s; below this speed the v-bot counts as standing."""
 TRACK_GAIN_X, TRACK_GAIN_Y, TRACK_GAIN_YAW = 1.5, 6.0, 3.0
 """Gains along the heading (1/s), across it (1/m²), and of the heading error (1/m)."""
 CARROT_SHARES = (1.0, 0.7, 0.45, 0.25)
-"""Shares of the lookahead that are tried in turn while the arc to the carrot would touch something."""
+"""Shares of the lookahead that are tried in turn until the arc to the carrot is free."""
 
 
 @dataclass(frozen=True)
@@ -54,7 +54,7 @@ class FollowerConfig:
     """Parameters, with the names of nav2's regulated pure pursuit where it has them.
 
     Attributes:
-        desired_linear_vel: m/s; above the operator's usual 0.4, so that the r-bot catches up.
+        desired_linear_vel: m/s; higher than the operator's usual 0.4, so that the r-bot catches up.
         min_lookahead_dist: m; shortest distance of the carrot.
         max_lookahead_dist: m; longest distance of the carrot.
     """
@@ -79,7 +79,7 @@ class FollowerCommand:
 
 
 class PathFollower:
-    """Follows a plan; its only state is whether it turns on the spot or stands at the goal.
+    """A follower of plans. Its only state is whether the robot turns on the spot, or is at the goal.
 
     Forward and backward stretches of the path are followed one after the other.
     """
@@ -108,9 +108,9 @@ class PathFollower:
         Args:
             pose: x, y, yaw in the frame of the plan.
             speed_m_s: the robot's speed.
-            plan: newest plan; an empty one stops the robot, and so does a value that is not finite.
+            plan: newest plan; the robot stops if it is empty, or if any input is not finite.
             goal_velocity: velocity of the goal (m/s, rad/s) when it is a driving v-bot.
-            costmap: checks arcs to the carrot for collisions; None: no check.
+            costmap: costs by which arcs to the carrot are checked for collisions; None: no check.
         """
         if len(plan.poses) == 0 or not np.isfinite([*pose, speed_m_s, *goal_velocity]).all():
             return FollowerCommand((0.0, 0.0), "end")
@@ -119,8 +119,8 @@ class PathFollower:
         distance = math.hypot(ahead, left)
         moving = plan.reached and max(abs(goal_velocity[0]), abs(goal_velocity[1])) > STANDS_BELOW
         near = distance < TRACK_DISTANCE_M and abs(turn) < 1.0
-        # Tracking drives straight to the goal, so the path must be straight too. A very near goal beside the robot is
-        # also tracked: a manoeuvre is not worth it for a moving goal.
+        # Tracking drives straight to the goal, so the path must be straight too. A goal close beside the robot is
+        # tracked as well, because a manoeuvre does not pay for a moving goal.
         if (
             moving
             and near
@@ -141,10 +141,10 @@ class PathFollower:
         return self._pursue(pose, speed_m_s, plan, costmap)
 
     def _track(self, ahead: float, left: float, turn: float, goal_velocity: tuple[float, float]) -> tuple[float, float]:
-        """Apply the tracking law of Kanayama et al. (1990): the goal's own twist plus the error at the robot."""
+        """Apply the tracking law of Kanayama et al. (1990): the goal's twist, corrected by the robot's pose error."""
         linear, angular = goal_velocity
         v = linear * math.cos(turn) + TRACK_GAIN_X * ahead
-        # abs: the law is for forward motion. Backwards, the heading term would turn the robot away.
+        # abs, because the law is made for forward motion: backwards, the heading term would turn the robot away.
         w = angular + linear * TRACK_GAIN_Y * left + abs(linear) * TRACK_GAIN_YAW * math.sin(turn)
         most = self.config.desired_linear_vel
         return self.limits.clip(min(max(v, -most), most), w)
@@ -180,7 +180,7 @@ class PathFollower:
         return FollowerCommand(self.limits.clip(v, v * curvature), "reverse" if back else "pursue")
 
     def _rotate(self, pose: NDArray[np.float64], bearing: float, costmap: Costmap | None) -> FollowerCommand:
-        """Turn on the spot; the other way round if the shorter turn is blocked."""
+        """Turn on the spot, in the other direction if the shorter turn is blocked."""
         if not self._turn_is_free(pose, bearing, costmap):
             bearing -= math.copysign(2.0 * math.pi, bearing)
             if not self._turn_is_free(pose, bearing, costmap):
@@ -208,7 +208,7 @@ class PathFollower:
         return self._is_free(pose + share * np.array([*(goal[:2] - pose[:2]), turn]), costmap)
 
     def _is_free(self, poses: NDArray[np.float64], costmap: Costmap | None) -> bool:
-        """Return whether no pose overlaps more obstacle points than the first one, where the robot stands."""
+        """Return whether no pose overlaps more obstacles than the first pose, where the robot stands."""
         if costmap is None:
             return True
         overlap = costmap.lethal_overlap(poses, self._body)
@@ -216,13 +216,13 @@ class PathFollower:
 
     def _turn_rate(self, angle: float) -> float:
         rate = max(ROTATE_GAIN * abs(angle), 0.1)
-        # Never faster than the robot can stop before the angle is reached.
+        # The robot must be able to stop before it has turned by the whole angle.
         rate = min(rate, math.sqrt(self.limits.max_angular_accel_rad_s2 * abs(angle)))
         return math.copysign(min(rate, self.limits.max_angular_rad_s), angle)
 
 
 def _piece(pose: NDArray[np.float64], plan: Plan, tolerance_m: float) -> tuple[NDArray[np.float64], bool]:
-    """Return the next part of the path with one driving direction, and whether it is driven backwards."""
+    """Return the next stretch of the path in one driving direction, and whether it is driven backwards."""
     if len(plan.reverse) != len(plan.poses) or len(plan.poses) < 2:
         return plan.poses, False
     # A turn on the spot belongs to the piece that follows it.
@@ -242,7 +242,7 @@ def _piece(pose: NDArray[np.float64], plan: Plan, tolerance_m: float) -> tuple[N
 
 
 def _carrot(pose: NDArray[np.float64], path: NDArray[np.float64], lookahead: float) -> NDArray[np.float64]:
-    """Return the point (2,) of the path at distance ``lookahead`` from the robot, past its nearest point."""
+    """Return the first point (2,) of the path at least ``lookahead`` from the robot, after the point nearest to it."""
     away = np.linalg.norm(path[:, :2] - np.asarray(pose)[:2], axis=1)
     near = int(np.argmin(away))
     far = np.flatnonzero(away[near:] >= lookahead)

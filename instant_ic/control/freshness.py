@@ -13,12 +13,12 @@ from instant_ic.config.ranges import Checked, Plausible
 _Timeout: TypeAlias = Annotated[float, Plausible(0.05, 2)]
 """At most 2 s: the robot must not drive on older data or commands."""
 _ImageTimeout: TypeAlias = Annotated[float, Plausible(0.05, 10)]
-"""Images may be rarer: the robot then drives slower (``image_travel_m``)."""
+"""Images may be older, because the robot then drives slower (``image_travel_m``)."""
 
 IMAGES = ("camera", "view")
 """Sources that show the operator the robot's place."""
 _LATE_SHARE = 0.25
-"""Rare images arrive late by up to this share of their period, which may exceed ``late_s``."""
+"""Images may be late by this share of their period, if that is more than ``late_s``."""
 _UNKNOWN_PERIOD_S = 0.5
 """Period assumed for images until their rate is known."""
 
@@ -28,8 +28,8 @@ class TimeoutConfig(Checked):
     """Seconds of silence after which a source is stale and the command is zero.
 
     An image source (camera, view) has its own rate: it is stale ``late_s`` after its usual arrival, if that is later.
-    The period of images may be as long as ``slowest_image_s``: the robot then drives slower, at most ``image_travel_m``
-    per image. All other sources keep the robot off obstacles and have fixed time-outs.
+    Images may be up to ``slowest_image_s`` apart. The robot then drives slower, at most ``image_travel_m`` per image.
+    All other sources keep the robot off obstacles and have fixed time-outs.
 
     Attributes:
         scan: s; ``/scan``.
@@ -41,11 +41,12 @@ class TimeoutConfig(Checked):
         vbot: s; ``/vbot/odom``.
         nav: s; ``/nav/cmd_vel``.
         command: s; ``/operator/cmd_vel``.
-        estop_input: s; ``/robot/estop``, from a button that repeats its state; 0: it reports only changes.
+        estop_input: s; ``/robot/estop``, from a button that repeats its state; 0: the button reports only changes.
         vspace: s; ``/vspace/status``.
         late_s: seconds after its usual arrival at which an image counts as late.
         slowest_image_s: longest period of images in seconds at which the robot starts.
-        image_travel_m: largest distance in metres driven until a missing image stops the robot: slower at low rates.
+        image_travel_m: largest distance in metres driven before a missing image stops the robot; limits the speed at
+            low image rates.
         stop_after_s: seconds of silence that lead to STOPPED.
         recover_s: seconds for which every source must be fresh before the robot drives on.
     """
@@ -68,7 +69,7 @@ class TimeoutConfig(Checked):
     recover_s: Annotated[float, Plausible(0.05, 10)] = 0.5
 
     def allowed_s(self, key: str, usual_s: float | None = None) -> float:
-        """Return the allowed age of source ``key`` in seconds, if its usual age on arrival is ``usual_s``.
+        """Return the allowed age of source ``key`` in seconds. ``usual_s`` is its usual age when a message arrives.
 
         >>> timeouts = TimeoutConfig()
         >>> [round(timeouts.allowed_s("camera", usual_s), 2) for usual_s in (0.1, 0.2, 0.33, 1.0, 2.0, math.inf)]
@@ -81,7 +82,7 @@ class TimeoutConfig(Checked):
         return max(least, period_s + max(self.late_s, _LATE_SHARE * period_s))
 
     def lost_s(self, key: str, usual_s: float | None = None) -> float:
-        """Return the seconds of silence after which source ``key`` counts as lost: the machine goes to STOPPED.
+        """Return the seconds of silence after which source ``key`` counts as lost and the arbiter goes to STOPPED.
 
         A single missing image is never a loss.
         """
@@ -91,10 +92,10 @@ class TimeoutConfig(Checked):
 
 
 class Rhythm:
-    """Usual age of a source when its next message arrives: its period, plus its delay where age counts from the stamp.
+    """Usual age of a source when its next message arrives: its period, plus its delay if ages count from the stamp.
 
-    It is the median of the last messages, or of the newest ones if that is longer: after two late images the robot
-    drives slower, instead of stopping at each of the next ten. It is inf until ``_NEEDED`` messages have arrived.
+    The usual age is the larger of two medians, of the last ``_KEPT`` messages and of the last ``_NEWEST``: after two
+    late images the robot drives slower, instead of stopping at each of the next ten.
     """
 
     _NEEDED, _KEPT, _NEWEST = 5, 20, 3
@@ -103,13 +104,13 @@ class Rhythm:
         self._ages: deque[float] = deque(maxlen=self._KEPT)
 
     def heard(self, age_s: float) -> None:
-        """Record an arrival and the previous message's age. Ages from a pause or a clock change are ignored."""
+        """Record the previous message's age when a new one arrives. Ages after a pause or clock change are ignored."""
         if 0.0 <= age_s < 2.0:
             self._ages.append(age_s)
 
     @property
     def usual_s(self) -> float:
-        """Seconds; inf while unknown."""
+        """Usual age in seconds; inf until ``_NEEDED`` messages have arrived."""
         ages = list(self._ages)
         if len(ages) < self._NEEDED:
             return math.inf

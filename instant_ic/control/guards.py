@@ -15,12 +15,12 @@ from instant_ic.control.sources import images_too_rare
 from instant_ic.control.states import GUARDS, Reason
 
 MIN_SWITCH_SPEED_M_S = 0.03
-"""Forward speed below which the robot counts as turning."""
+"""Forward speed below which the robot counts as turning on the spot."""
 RETURN_SIDE_M = 0.12
 """Width beside the footprint, on each side, that must be free for a return."""
 _SILENT_S = 1.0
-"""Seconds of silence after which the controls count as released, if none was held before: a link that pauses reports no
-release of a held key."""
+"""Seconds of silence after which the controls count as released. This holds only if none was held before, since a link
+that pauses does not report the release of a held key."""
 
 POSE_UNKNOWN = Notice(Reason.POSE_UNKNOWN, "The robot's pose in the map is not known. Wait for the SLAM.")
 NO_COSTMAP = Notice(Reason.NO_COSTMAP, "There is no costmap yet. Wait for a LiDAR scan.")
@@ -64,15 +64,15 @@ def no_view_in_time(s: Snapshot) -> bool:
 
 
 def way_free(s: Snapshot) -> bool:
-    """Return whether the way that triggers an entry is free, and also a longer and wider one.
+    """Return whether the way is free over the horizon that triggers an entry, and over a longer and wider one.
 
-    So the conditions of entry and return never hold together.
+    The margin ensures that the conditions of entry and return never hold together.
     """
     inputs, switch, command = s.inputs, s.config.switch, s.command
     if inputs.robot_pose is None or inputs.costmap is None:
         return False
     if command == NO_MOTION and s.idle_s < switch.neutral_return_s:
-        # The operator has let go before the obstacle, and most likely repeats the last command. So the real view
+        # The operator has let go before the obstacle and will most likely repeat the last command, so the camera image
         # returns only after a while.
         command = s.last_command
     return all(
@@ -87,7 +87,7 @@ def way_free(s: Snapshot) -> bool:
 def view_fits(s: Snapshot) -> bool:
     switch = s.config.switch
     vbot_placed = s.inputs.age("vbot") < s.in_mode_s
-    # Without fresh commands nobody would drive the v-bot that the r-bot follows.
+    # Without fresh commands nobody would drive the v-bot, and the r-bot follows the v-bot.
     return (
         vbot_placed
         and s.fresh
@@ -115,9 +115,9 @@ def image_fits(s: Snapshot) -> bool:
     switch = s.config.switch
     waited = s.in_mode_s / switch.return_timeout_s
     if waited >= 2.0:
-        return True  # the pose jitters by more than the thresholds; the page eases the rest
+        return True  # the pose jitters by more than the thresholds; the page eases the remaining error
     within_m, within_deg = switch.return_picture_m, switch.return_picture_yaw_deg
-    # Both of the last steps must agree: SLAM's heading jitters, and the page may still show the one before.
+    # The last two steps must both agree: SLAM's heading jitters, and the page may still show the previous one.
     yaw_gap = max(abs(s.yaw_gap_rad), abs(s.yaw_gap_before_rad))
     if s.gap_m > within_m or yaw_gap > math.radians(within_deg):
         return False
@@ -144,7 +144,7 @@ GUARD_FUNCTIONS: dict[str, Callable[[Snapshot], bool]] = {name: globals()[name] 
 
 
 def hold(s: Snapshot) -> Notice | None:
-    """Return the reason why nothing may move in this state; None when it may."""
+    """Return why the robots must not move in this state; None if they may."""
     if s.settles:
         return Notice(Reason.INTERRUPTED, "The robot's control stood still for a moment. The robot has stopped.")
     if s.stale:
@@ -159,8 +159,8 @@ def hold(s: Snapshot) -> Notice | None:
 def images_agree(s: Snapshot, within_m: float, within_deg: float) -> bool:
     """Return whether view and camera image show the same place, so that a switch between them does not jump.
 
-    They arrive at different times. The distance driven between the two arrivals is motion, not an error; but the
-    operator sees even that as a jump when it is large.
+    The two arrive at different times. The distance driven between the arrivals is motion, not an error, but the
+    operator sees a large one as a jump too.
     """
     inputs = s.inputs
     if inputs.robot_pose is None or abs(s.yaw_gap_rad) > math.radians(within_deg):
@@ -176,7 +176,7 @@ def images_agree(s: Snapshot, within_m: float, within_deg: float) -> bool:
 
 
 def against_switch(s: Snapshot) -> Notice | None:
-    """Return the reason against a switch with an obstacle ahead; ``passage`` checks the way round it."""
+    """Return why no switch is possible with an obstacle ahead; ``passage`` checks the way round it."""
     inputs, switch, vspace = s.inputs, s.config.switch, s.vspace
     assert inputs.robot_pose is not None
     if s.pose_doubtful:

@@ -1,14 +1,14 @@
-"""Obstacles by height, from 3D points: low and hanging things, without what can be driven over or under.
+"""Obstacles by height, from 3D points: low and hanging things, except those that the robot can drive over or under.
 
 1. ``sort_points``: place the points of a sweep in a level frame, each from the sensor's pose at its measurement, and
-   sort them by height. Note where the beams of each elevation and azimuth end.
-2. ``_clear``: remove the marks that a beam passes through at their own heights; weigh the others by the beams that end
-   in them against those that end just behind.
+   sort them by height. Record where the beams of each elevation and azimuth end.
+2. ``_clear``: remove the marks that a beam passes through at their own heights. For each other mark, weigh the beams
+   that end in it against those that end just behind it.
 3. ``_mark``: mark the cells of the obstacle points with their lowest and highest point.
 
-A scanner with few rings sees a low or a hanging thing only from afar: at 0.6 m above the ground, a lowest beam of -15°
-meets a thing 0.1 m high no nearer than 1.9 m. A mark therefore stays until a beam passes through the very heights at
-which it was made; a beam of the flat scan that passes over it proves nothing.
+A scanner with few rings sees a low or a hanging thing only from afar: 0.6 m above the ground, the lowest beam (-15°)
+meets a thing 0.1 m high no nearer than 1.9 m. A mark therefore stays until a beam passes through the heights at which
+it was made. A beam of the flat scan that passes over it proves nothing.
 """
 
 from __future__ import annotations
@@ -28,16 +28,17 @@ Cell = TypeVar("Cell", bound=np.generic)
 AZIMUTHS = 720
 """Number of azimuth bins."""
 ROW_RAD, ROWS = math.radians(2.0), 90
-"""Angle between the sensor's rings; number of elevation bins of this size, from straight down to straight up."""
+"""Size of an elevation bin, the angle between the sensor's rings, and number of bins from straight down to straight up.
+"""
 CLEAR_MARGIN_M = 0.15
-"""A beam must end this far behind a mark to clear it."""
+"""Distance behind a mark at which a beam must end to clear it."""
 INSIDE_WEIGHT, MOST_EVIDENCE = 4, 200
-"""Weight of a beam that ends in a mark against one that ends just behind it; bound of the sum."""
+"""Weight of a beam that ends in a mark, where one that ends just behind it weighs 1; bound of the sum."""
 FAST = {"contract", "arcp", "afn"}
 """Fast-math flags that keep nan and inf."""
 UNSEEN_EDGE_M, FAR_BEHIND_M = 0.1, 0.4
-"""A thing that only the lowest ring meets, from above, may begin the first distance before that point, if the next ring
-ends the second distance behind it."""
+"""A thing that only the lowest ring meets may begin nearer than the point where that ring meets its top. The first
+distance in front of the point is marked too, if the next ring ends at least the second distance behind it."""
 SCATTER_M = 0.01
 """Scatter of the heights of one surface, in metres: noise of the ranges, pitch of the robot."""
 INSTANTS = 65
@@ -49,14 +50,13 @@ class HeightConfig:
     """Limits of obstacles from 3D points, with nav2's names where nav2 has the parameter.
 
     Attributes:
-        enabled: false: the flat scan alone.
-        min_obstacle_height: m above the ground; lower points can be driven over.
-        max_obstacle_height: m; higher points can be passed under. The camera's mast is 1.20 m high.
-        ground_tilt_deg: degrees; apparent slope of the ground that is tolerated: the robot pitches, or the floor
-            slopes.
+        enabled: use 3D points; false: only the flat scan is used.
+        min_obstacle_height: m above the ground; the robot can drive over lower points.
+        max_obstacle_height: m; the robot can pass under higher points. The camera's mast is 1.20 m high.
+        ground_tilt_deg: tolerated slope of the ground in degrees, real or from the robot's pitch.
         obstacle_min_range: m from the LiDAR; nearer points are on the robot's own body.
         obstacle_max_range: m; farther points are not marked.
-        mark_threshold: points in a cell from which on it is an obstacle.
+        mark_threshold: number of points that make a cell an obstacle.
     """
 
     enabled: bool = True
@@ -80,16 +80,16 @@ class SortedPoints:
     """Points of one sweep in a level frame, sorted by height, without invalid measurements."""
 
     obstacles: NDArray[np.float32]
-    """(N, 3) obstacle points: metres, z above the ground."""
+    """(N, 3) obstacle points in metres; z is the height above the ground."""
     nearest: NDArray[np.float64]
-    """(M, 2) the nearest obstacle point in each direction that has one, as a flat scan would measure it."""
+    """(M, 2) nearest obstacle point in each direction that has one, as a flat scan would measure it."""
     ends: NDArray[np.float32]
-    """(ROWS, AZIMUTHS) nearest end of the beams of each elevation (from straight down) and azimuth (from -pi), metres
-    over ground; inf where no beam returned."""
+    """(ROWS, AZIMUTHS) horizontal distance in metres to the nearest end of the beams of each elevation (from straight
+    down) and azimuth (from -pi); inf where no beam returned."""
     origin: NDArray[np.float64]
     """(3,) position of the sensor at the end of the sweep."""
     counts: dict[str, int]
-    """Number of points of each kind: kept by the height filter (obstacle), or dropped."""
+    """Number of points of each kind: kept by the height filter (``obstacle``), or dropped."""
 
 
 def sort_points(
@@ -129,8 +129,8 @@ def sort_points(
 class HeightLayer:
     """Cells of a rolling window that hold an obstacle between two heights.
 
-    A cell is marked once ``mark_threshold`` points have fallen into it; it keeps the lowest and highest of them. It is
-    cleared when a beam at one of those heights ends well behind it and none ends in it.
+    A cell is marked once ``mark_threshold`` points have fallen into it. It keeps the height of the lowest and highest
+    of them, and is cleared when a beam between these heights ends well behind it and none ends in it.
 
     Noise of ranges and poses also marks cells in front of a surface. A mark is dismissed while nearly all beams at its
     heights end just behind it.
@@ -160,7 +160,7 @@ class HeightLayer:
 
     def carry(self, cells: NDArray[np.intp], goals: NDArray[np.intp]) -> None:
         """Move marks from ``cells`` to ``goals``, rows and columns (2, N); all others are forgotten."""
-        order = np.argsort(self.hits[cells[0], cells[1]])  # of two marks in one cell, the one with more points stays
+        order = np.argsort(self.hits[cells[0], cells[1]])  # if two marks meet in a cell, the one with more points wins
         (rows, columns), (to_rows, to_columns) = cells[:, order], goals[:, order]
         for layer in (self.hits, self.low, self.high, self.evidence):
             kept = layer[rows, columns]
@@ -168,7 +168,7 @@ class HeightLayer:
             layer[to_rows, to_columns] = kept
 
     def update(self, sweep: SortedPoints, placed: NDArray[np.float64], origin: NDArray[np.float64]) -> None:
-        """Add a sweep whose frame has the pose ``placed`` (x, y, yaw) in the window's frame.
+        """Add a sweep. ``placed`` is the pose (x, y, yaw) of its frame in the window's frame.
 
         ``origin`` (2,) is the window's outer corner.
         """
@@ -183,7 +183,7 @@ class HeightLayer:
         return (self.hits >= self.config.mark_threshold) & (self.evidence >= 0)
 
     def dismissed(self) -> NDArray[np.bool_]:
-        """Return the mask (H, W) of the cells that hold points, but only noise of a surface behind them."""
+        """Return the mask (H, W) of the cells whose points are only noise of a surface behind them."""
         return (self.hits > 0) & (self.evidence < 0)
 
 
@@ -200,7 +200,7 @@ def shifted(array: NDArray[Cell], columns: int, rows: int, fill: float) -> NDArr
 
 @njit(cache=True, fastmath=FAST)
 def _angle(y: float, x: float) -> float:
-    """Compute atan2 to 1e-5 rad, four times as fast (Hastings: Approximations for digital computers, 1955)."""
+    """Return atan2(y, x) to 1e-5 rad, four times as fast (Hastings: Approximations for digital computers, 1955)."""
     ax, ay = abs(x), abs(y)
     if ax == 0.0 and ay == 0.0:
         return 0.0
@@ -254,14 +254,14 @@ def _sort(
             counts[3] += 1
             continue
         x, y, z = dx + m[0, 3], dy + m[1, 3], dz + m[2, 3]
-        # Relative to the sensor's position at the end of the sweep.
+        # Position relative to the sensor at the end of the sweep.
         dx, dy, dz = x - sensor[0], y - sensor[1], z - sensor[2]
         distance = math.sqrt(dx * dx + dy * dy)
         column = _bin(dy, dx)
         row = min(int(_row(dz, distance)), ROWS - 1)
         if distance < ends[row, column]:
             ends[row, column] = distance
-        # The robot pitches a little: a tilt raises the ground in proportion to the distance.
+        # The robot pitches a little, and a tilt raises the ground in proportion to the distance.
         if z < low + slope * distance:
             counts[0] += 1
         elif z > high:
@@ -278,13 +278,13 @@ def _sort(
 
 @njit(cache=True, fastmath=FAST)
 def _row(dz: float, distance: float) -> float:
-    """Return the elevation of a point at a height and distance from the sensor, in rows from straight down."""
+    """Return the elevation of a point ``dz`` above and ``distance`` from the sensor, in rows from straight down."""
     return (_angle(dz, distance) + 0.5 * math.pi) * (1.0 / ROW_RAD)
 
 
 @njit(cache=True, fastmath=FAST)
 def _poses_between(poses: NDArray[np.float64], duration_s: float) -> NDArray[np.float64]:
-    """Return the sensor's poses (INSTANTS, 4, 4) at even instants of a sweep, between those given, (K, 4, 4)."""
+    """Return the sensor's poses (INSTANTS, 4, 4) at even instants of a sweep, interpolated from ``poses`` (K, 4, 4)."""
     last = poses.shape[0] - 1
     between = np.empty((INSTANTS, 4, 4))
     for i in range(INSTANTS):
@@ -319,10 +319,10 @@ def _clear(
     sensor: NDArray[np.float64],
     placed: NDArray[np.float64],
 ) -> None:
-    """Clear the marks that beams pass through, and count the beams that end in the others and just behind them.
+    """Clear the marks that beams pass through. For the others, count the beams that end in them and just behind them.
 
-    A beam above a low thing or below a hanging one proves nothing, and from near no beam ever sees it again. So a mark
-    ends only with a beam well between its heights; a beam that ends there, or nearly so, keeps it.
+    A beam above a low thing or below a hanging one proves nothing, and from near no beam sees the thing again. So only
+    a beam well between a mark's heights clears it; a beam that ends in the mark or close to it keeps it.
     """
     hits, low, high, evidence = marks
     resolution = window.resolution
@@ -361,7 +361,7 @@ def _clear(
 
 @njit(cache=True)
 def _evidence(ends: NDArray[np.float32], rows: range, column: int, distance: float, resolution: float) -> int:
-    """Count the beams that end in a mark, weighted, less those that end just behind it."""
+    """Return the weighted number of beams that end in a mark, less the number that end just behind it."""
     wide = int(0.5 * resolution / distance * AZIMUTHS / (2.0 * math.pi))
     change = 0
     for row in rows:
@@ -370,7 +370,7 @@ def _evidence(ends: NDArray[np.float32], rows: range, column: int, distance: flo
             if abs(ends[row, beam] - distance) <= 0.5 * resolution:
                 change += INSIDE_WEIGHT
                 continue
-            # A single ring may end on the top of a low thing, or under a hanging one, whose edge is the mark.
+            # A single ring may end on top of a low thing, or under a hanging one, and the mark is the thing's edge.
             behind = True
             for ring in range(row - 1, row + 2):
                 behind &= 0.5 * resolution < ends[ring, beam] - distance <= CLEAR_MARGIN_M
@@ -388,7 +388,7 @@ def _mark(
     placed: NDArray[np.float64],
     range_max: float,
 ) -> None:
-    """Mark the cells of obstacle points, and those before a thing that only the lowest ring meets."""
+    """Mark the cells of obstacle points, and the cells in front of a thing that only the lowest ring meets."""
     hits, low, high, evidence = marks
     resolution = window.resolution
     cos, sin = math.cos(placed[2]), math.sin(placed[2])

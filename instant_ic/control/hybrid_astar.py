@@ -26,13 +26,13 @@ class GridMap(NamedTuple):
     body: NDArray[np.float64]
     """(M, 2) points of the footprint, farthest first."""
     bodies: NDArray[np.float64]
-    """(bins, M, 2) the same at each heading."""
+    """(bins, M, 2) these points at each heading."""
     reach: float
-    """Nothing can touch where the clearance is larger."""
+    """Clearance above which no part of the footprint can touch anything."""
 
 
 class GridPose(NamedTuple):
-    """A pose: cells, radians."""
+    """A pose: position in cells, heading in radians."""
 
     x: float
     y: float
@@ -46,7 +46,7 @@ class SearchRules(NamedTuple):
     escape: float
     change_price: float
     turn_price: float
-    """Price of one radian."""
+    """Price of one radian turned on the spot."""
     reverse_penalty: float
     curve_penalty: float
     closed_weight: float
@@ -57,15 +57,15 @@ class _Nodes(NamedTuple):
     """Poses that the search has reached, (N,) each."""
 
     place: NDArray[np.float64]
-    """(N, 2)"""
+    """(N, 2) positions in cells."""
     heading: NDArray[np.int32]
     parent: NDArray[np.int32]
-    """-1 for the start."""
+    """Node before this one; -1 for the start."""
     drive: NDArray[np.int8]
-    """How it was reached: FORWARD, BACKWARD or TURN."""
+    """Motion that reached the node: FORWARD, BACKWARD or TURN."""
     price: NDArray[np.float32]
     overlap: NDArray[np.int32]
-    """Points of the body on lethal cells."""
+    """Number of the body's points on lethal cells."""
 
 
 FORWARD, BACKWARD, TURN = 0, 1, 2
@@ -93,7 +93,7 @@ def cell_weights(
         near: mask (H, W) of the previous path.
         unknown: cost of one cell length in unseen cells.
         cost_penalty: extra price of a cell length at cost 252.
-        tight: cost above which the robot cannot turn on the spot, and the further price at cost 252.
+        tight: cost above which the robot cannot turn on the spot, and the additional price at cost 252.
         retrospective_gain: discount along the previous path.
     """
     tight_cost, tight_penalty = tight
@@ -122,12 +122,12 @@ def cost_to_go(
     least_weight: float,
     closed_weight: float,
 ) -> NDArray[np.float32]:
-    """Return the cost in cells (H, W) of the point robot's way to a goal (row, column), by Dijkstra's method.
+    """Return the cost in cells (H, W) of a point robot's way to a goal (row, column), by Dijkstra's method.
 
-    It is limited to the cells on possible ways to the start: there, cost plus straight distance to the start is little
-    more than the cost of the best way (A*); all others are inf. Inscribed cells within ``escape`` cells of the start
-    get ``closed_weight`` (lethal ones within a quarter of that): the robot may stand there. ``least_weight`` is the
-    lower bound of ``weights``, the cost of one cell length, (H, W).
+    Only cells on likely ways to the start get a cost: those whose cost plus straight distance to the start is little
+    more than the cost of the best way (A*). All others are inf. Closed cells near the start get ``closed_weight``,
+    because the robot may stand there: inscribed cells within ``escape`` cells, lethal ones within a quarter of that.
+    ``least_weight`` is the lower bound of ``weights``, the cost of one cell length, (H, W).
     """
     start_row, start_column = start
     row, column = goal
@@ -173,9 +173,9 @@ def cost_to_go(
 def _overlap(
     costs: NDArray[np.uint8], clearance: NDArray[np.float32], x: float, y: float, body: NDArray[np.float64]
 ) -> int:
-    """Count the body's points, already rotated, in lethal cells; the centre is at (x, y) in cells.
+    """Count the points of a rotated ``body`` on lethal cells; its centre is at (x, y) in cells.
 
-    The points are sorted farthest first: those nearer than the nearest lethal cell are skipped.
+    The points are sorted farthest first, so that those nearer than the nearest lethal cell are skipped.
     """
     height, width = costs.shape
     nearest = max(clearance[math.floor(y), math.floor(x)] - 1.5, 0.0)
@@ -201,9 +201,9 @@ def _turned(body: NDArray[np.float64], yaw: float) -> NDArray[np.float64]:
 
 @njit(cache=True)
 def _line_cost(grid: GridMap, ax: float, ay: float, bx: float, by: float, yaw: float, dearest: float) -> float:
-    """Return the cost in cells of a straight way at a heading.
+    """Return the cost in cells of a straight way from a to b at a heading.
 
-    It is inf where the footprint meets something, or a cell is dearer than ``dearest``.
+    The cost is inf if the footprint meets an obstacle, or if a cell costs more than ``dearest``.
     """
     height, width = grid.costs.shape
     length = math.hypot(bx - ax, by - ay)
@@ -260,7 +260,7 @@ def _new_nodes(room: int) -> _Nodes:
 
 @njit(cache=True)
 def _doubled(nodes: _Nodes) -> _Nodes:
-    """Return the same nodes with twice the room."""
+    """Return the same nodes in arrays of twice the size."""
     room = len(nodes.price)
     more = _new_nodes(2 * room)
     more.place[:room], more.heading[:room], more.parent[:room] = nodes.place, nodes.heading, nodes.parent
@@ -281,11 +281,11 @@ def _set_node(
 def search(
     grid: GridMap, to_go: NDArray[np.float32], start: GridPose, goal: GridPose, rules: SearchRules
 ) -> tuple[NDArray[np.float64], bool, int]:
-    """Search by hybrid A*. Headings stay on the bins, positions are continuous; one pose is kept per cell and heading.
+    """Search by hybrid A*. Headings are bins, positions are continuous; one pose is kept per cell and heading.
 
-    ``to_go`` is the point robot's cost-to-go in cells, (H, W). A goal whose yaw is nan is reached at any heading.
-    Returns poses (N, 4) in cells and radians, the fourth 1 where reached backwards; whether they reach the goal; and
-    the number of poses expanded.
+    ``to_go`` is the point robot's cost-to-go in cells, (H, W). A goal whose yaw is nan may be reached at any heading.
+    Returns poses (N, 4) in cells and radians, the fourth column 1 where the robot drives backwards; whether they reach
+    the goal; and the number of poses expanded.
     """
     nodes, best, closed = _begin(grid, start)
     bins, height, width = best.shape
@@ -319,7 +319,7 @@ def search(
             other = (heading + TURNS[k]) % bins
             weight = grid.weights[r, c]
             if closed[other, r, c] or (weight == 0.0 and nodes.overlap[node] == 0 and grid.costs[row, column] < 253):
-                continue  # the robot may leave closed cells, never enter them
+                continue  # the robot may leave closed cells, but never enter them
             weight = weight if weight != 0.0 else np.float32(rules.closed_weight)
             new = nodes.price[node] + _step_price(k, weight, nodes.drive[node], per_bin, rules)
             if new >= best[other, r, c] - 1e-4:
@@ -342,7 +342,7 @@ def search(
 
 @njit(cache=True)
 def _begin(grid: GridMap, start: GridPose) -> tuple[_Nodes, NDArray[np.float32], NDArray[np.bool_]]:
-    """Return the nodes with the start as node 0; and the lowest price and whether closed of each heading and cell."""
+    """Return the nodes with the start as node 0, and for each heading and cell the lowest price and a closed flag."""
     height, width = grid.costs.shape
     bins = grid.bodies.shape[0]
     first = math.floor(start.yaw / (2.0 * math.pi / bins) + 0.5) % bins
@@ -365,9 +365,10 @@ def _straight_to_goal(
     left: float,
     goal_price: float,
 ) -> tuple[float, int]:
-    """Try the straight way to the goal, always from near and sometimes from far; return a lower price, and backwards.
+    """Try the straight way to the goal, always when near and sometimes from far.
 
-    ``opened``: number of poses expanded. ``left``: cost-to-go of the point robot.
+    ``opened`` is the number of poses expanded, ``left`` the point robot's cost-to-go. Returns ``goal_price``, or the
+    price of this way if that is lower, and 1 if the way is driven backwards.
     """
     backwards = 0
     away = math.hypot(goal.x - nodes.place[node, 0], goal.y - nodes.place[node, 1])
@@ -381,7 +382,7 @@ def _straight_to_goal(
 
 @njit(cache=True)
 def _drive_of(k: int) -> int:
-    """Return the drive of primitive ``k``."""
+    """Return the motion of primitive ``k``: FORWARD, BACKWARD or TURN."""
     if LENGTHS[k] == 0.0:
         return TURN
     return BACKWARD if LENGTHS[k] < 0.0 else FORWARD
@@ -389,7 +390,7 @@ def _drive_of(k: int) -> int:
 
 @njit(cache=True)
 def _moved(x: float, y: float, heading: int, k: int, per_bin: float) -> tuple[float, float]:
-    """Return the end of primitive ``k`` from a place and a heading."""
+    """Return the position at the end of primitive ``k``, from a position and a heading."""
     length = LENGTHS[k]
     if length == 0.0:
         return x, y
@@ -399,7 +400,7 @@ def _moved(x: float, y: float, heading: int, k: int, per_bin: float) -> tuple[fl
 
 @njit(cache=True)
 def _step_price(k: int, weight: float, before: int, per_bin: float, rules: SearchRules) -> float:
-    """Return the price of primitive ``k`` into a cell of ``weight``, after the drive ``before``."""
+    """Return the price of primitive ``k`` into a cell of ``weight``, after the motion ``before``."""
     drive = _drive_of(k)
     if drive == TURN:
         return rules.turn_price * per_bin * weight
@@ -415,12 +416,12 @@ def _step_price(k: int, weight: float, before: int, per_bin: float, rules: Searc
 def _touching(
     grid: GridMap, nodes: _Nodes, node: int, k: int, x: float, y: float, start: GridPose, escape: float
 ) -> int:
-    """Count the body's points on lethal cells at the end (x, y) of primitive ``k``; -1 where it may not go."""
+    """Count the body's points on lethal cells at the end (x, y) of primitive ``k``; -1 if that end is not allowed."""
     bins = grid.bodies.shape[0]
     heading, before = nodes.heading[node], nodes.overlap[node]
     touching = _overlap(grid.costs, grid.clearance, x, y, grid.bodies[(heading + TURNS[k]) % bins])
     if touching > 0:
-        # Contact is allowed only to a robot that stands on an obstacle already, so that it can leave.
+        # Contact is allowed only if the robot stands on an obstacle already, so that it can leave.
         near = math.hypot(x - start.x, y - start.y) <= escape
         return -1 if before == 0 or touching > before or not near else touching
     if LENGTHS[k] != 0.0 and before == 0:
@@ -449,9 +450,9 @@ def _price_to_goal(
     left: float,
     most: float,
 ) -> float:
-    """Return the price of the goal by a turn, a straight line and a turn; inf where not free or not below ``most``.
+    """Return the price of the goal by a turn, a straight line and a turn; inf if not free or not below ``most``.
 
-    ``left``: cost-to-go of the point robot.
+    ``left`` is the point robot's cost-to-go.
     """
     x, y = nodes.place[node, 0], nodes.place[node, 1]
     heading = nodes.heading[node] * (2.0 * math.pi / grid.bodies.shape[0])
@@ -466,7 +467,7 @@ def _price_to_goal(
     if total + share * away >= most or not _turn_is_free(grid, x, y, heading, turn):
         return np.inf
     line = _line_cost(grid, x, y, goal.x, goal.y, yaw, np.inf)
-    # The point robot's way gives no bound at a place beside a better line.
+    # Beside a better line, the point robot's cost-to-go is no bound on the price.
     return total + share * line if line <= 1.05 * left + 3.0 else np.inf
 
 
@@ -474,7 +475,7 @@ def _price_to_goal(
 def _path_to(
     nodes: _Nodes, end: int, bins: int, start: GridPose, goal: GridPose, found: bool, goal_backwards: int
 ) -> NDArray[np.float64]:
-    """Return the poses (N, 4) from the start to node ``end``, and on to the goal where it was found."""
+    """Return the poses (N, 4) from the start to node ``end``, and on to the goal if it was found."""
     number, node = 0, end
     while node >= 0:
         number += 1
@@ -507,7 +508,7 @@ def _weight_at(weights: NDArray[np.float32], node: NDArray[np.float64]) -> float
 def smooth(grid: GridMap, nodes: NDArray[np.float64]) -> NDArray[np.float64]:
     """Replace runs of forward poses (N, 4) by straight lines that cost no more."""
     count = len(nodes)
-    along = np.zeros(count)  # cost from the first node on
+    along = np.zeros(count)  # cost from the first node to each node
     for i in range(1, count):
         length = math.hypot(nodes[i, 0] - nodes[i - 1, 0], nodes[i, 1] - nodes[i - 1, 1])
         along[i] = along[i - 1] + length * max(_weight_at(grid.weights, nodes[i]), 1.0)

@@ -1,4 +1,4 @@
-"""Interruptions after which the operator must release the controls, although every source is fresh again."""
+"""Interruptions after which the operator must release the controls, even if every source is fresh again."""
 
 from __future__ import annotations
 
@@ -14,18 +14,18 @@ WATCHED = {"odometry": "base driver", "nav": "navigator", "vbot": "virtual robot
 
 
 class Interruptions:
-    """Detector of events after which a held key must not drive on: a long gap, a suspended machine, a new process."""
+    """Detector of events after which a held key must not drive on: a long gap, a suspension, a restarted node."""
 
     def __init__(self) -> None:
         self.gap = StepGap()
         self.gap_s = 0.0
-        """Gap that ends with the present step."""
+        """Seconds since the previous step if that was too long, else 0."""
         self._instances: dict[tuple[str, str], bytes] = {}
 
     def step(
         self, steady_ns: int, suspended_ns: int, instances: Mapping[tuple[str, str], bytes], longest_s: float
     ) -> Notice | None:
-        """Note a step of the arbiter; return what has happened since the one before, None for nothing.
+        """Record a step of the arbiter; return the interruption since the previous step, or None.
 
         ``suspended_ns`` and ``instances`` are as in ``ArbiterInputs``; a gap above ``longest_s`` is an interruption.
         """

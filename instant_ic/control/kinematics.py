@@ -30,6 +30,6 @@ def move(pose: NDArray[np.float64], linear: float, angular: float, dt_s: float) 
 
 
 def extrapolate(pose: NDArray[np.float64], velocity: tuple[float, float], age_s: float) -> NDArray[np.float64]:
-    """Return the pose (3,) of a message, moved on by the message's age, at most 0.1 s."""
+    """Return the pose (3,) of a message, moved on at ``velocity`` by the message's age, at most 0.1 s."""
     known = math.isfinite(velocity[0]) and math.isfinite(velocity[1])
     return move(pose, *velocity, min(max(0.0, age_s), 0.1)) if known else pose.copy()

@@ -1,8 +1,8 @@
 """People and other moving things, as points with a velocity.
 
-A tall thing counts as moving when its points lie in space that the LiDAR saw free shortly before, and it keeps moving
-as one body. Its shape does not matter, only its height: low and hanging things come into view and vanish as the robot
-drives, so their edges seem to move.
+A tall thing counts as moving when its points lie in space that the LiDAR saw free shortly before, and when it keeps
+moving as one body. Only its height matters, not its shape. Low and hanging things are left out: they come into view
+and vanish as the robot drives, so their edges seem to move.
 """
 
 from __future__ import annotations
@@ -23,13 +23,13 @@ _RANGE_M = 4.0
 _COMPARED_S = (0.3, 0.8)
 """Ages of the sweeps with which a new one is compared, in seconds."""
 _KEPT_S = 0.8
-"""Time for which a body that is no longer seen (in the LiDAR's blind zone) is moved on."""
+"""Time in seconds for which a body that is out of sight (in the LiDAR's blind zone) is extrapolated."""
 _MARGIN_M = 0.15
 _BODY_M = 0.35
 """Points nearer than this to a body's centre belong to it."""
 _LEAST_POINTS = 3
 _TALL_ROWS = 6
-"""Smallest number of elevations at which a body is hit."""
+"""Smallest number of elevations at which beams must hit a body."""
 
 
 @dataclass(frozen=True)
@@ -45,23 +45,23 @@ NOTHING_MOVES = MovingPoints(np.zeros((0, 2)), np.zeros((0, 2)))
 
 @dataclass(frozen=True)
 class _Look:
-    """The nearest thing in each direction of one sweep, seen flat."""
+    """The nearest thing in each horizontal direction of one sweep."""
 
     time_s: float
     origin: NDArray[np.float64]
     ranges: NDArray[np.float64]
-    """(AZIMUTHS,) metres; inf where nothing stands."""
+    """(AZIMUTHS,) metres; inf where no beam returned."""
     tall: NDArray[np.bool_]
-    """(AZIMUTHS,) whether enough elevations are hit at this range."""
+    """(AZIMUTHS,) true where beams of enough elevations end at this range."""
 
     def points(self) -> NDArray[np.float64]:
-        """Return the tall things within ``_RANGE_M``, by azimuth, (M, 2)."""
+        """Return the points (M, 2) of tall things within ``_RANGE_M``, ordered by azimuth."""
         index = np.flatnonzero(self.tall & (self.ranges < _RANGE_M))
         angle = (index + 0.5) * (2 * math.pi / AZIMUTHS) - math.pi
         return self.origin + self.ranges[index, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
 
     def free_at(self, points: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Return for each point (M, 2) whether all beams beside it went well past it, (M,)."""
+        """Return the mask (M,) of the points (M, 2) that all beams beside them passed by a good margin."""
         away = points - self.origin
         column = np.floor((np.arctan2(away[:, 1], away[:, 0]) + math.pi) * (AZIMUTHS / (2 * math.pi))).astype(np.int64)
         around = self.ranges[(column[:, None] + np.arange(-2, 3)) % AZIMUTHS].min(axis=1)
@@ -87,7 +87,7 @@ class _MovingBody:
 
     @property
     def stands(self) -> bool:
-        """True if it has not moved since it was found: a thing, or a person who has stopped."""
+        """True if the body has not moved since it was found: a thing, or a person who has stopped."""
         return len(self.places) >= 6 and float(np.hypot(*self.velocity)) < 0.5 * _LEAST_SPEED_M_S
 
     def at(self, time_s: float) -> NDArray[np.float64]:
@@ -96,7 +96,7 @@ class _MovingBody:
 
 
 class MovingThings:
-    """Follows moving bodies from sweep to sweep, in a frame that does not jump (``odom``)."""
+    """A tracker of moving bodies from sweep to sweep, in a frame that does not jump (``odom``)."""
 
     def __init__(self) -> None:
         self._looks: deque[_Look] = deque()
@@ -134,7 +134,7 @@ class MovingThings:
         return mine
 
     def moving(self, time_s: float) -> MovingPoints:
-        """Return the points of all moving bodies, moved on to ``time_s``."""
+        """Return the points of all moving bodies, extrapolated to ``time_s``."""
         parts = []
         for body in self._bodies:
             velocity = body.velocity
@@ -163,6 +163,6 @@ def _middle(points: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _groups(points: NDArray[np.float64]) -> list[NDArray[np.float64]]:
-    """Return runs of at least ``_LEAST_POINTS`` neighbours by azimuth no farther apart than ``_MARGIN_M``."""
+    """Split points, ordered by azimuth, at gaps over ``_MARGIN_M``; return groups of ``_LEAST_POINTS`` or more."""
     gaps = np.flatnonzero(np.linalg.norm(np.diff(points, axis=0), axis=1) > _MARGIN_M) + 1
     return [group for group in np.split(points, gaps) if len(group) >= _LEAST_POINTS]

@@ -1,4 +1,4 @@
-"""Drives the r-bot to a subgoal: plans on each new costmap, follows at the controller's rate."""
+"""Navigator of the r-bot to a subgoal: it plans on each new costmap and follows at the controller's rate."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from instant_ic.control.snapshot import Twist2
 from instant_ic.geometry.poses import relative2
 
 _STUCK_AFTER_NS = 1_500_000_000
-"""Time of commands without motion after which the robot backs off."""
+"""Time for which the robot is commanded to move and does not, before it backs off."""
 _RECOVERY_NS = 1_500_000_000
 """Duration of backing off."""
 _RECOVERY_M_S = 0.15
@@ -25,9 +25,9 @@ _RECOVERY_M_S = 0.15
 _MOVED_M, _TURNED_RAD = 0.03, 0.05
 """The robot counts as moving when it exceeds either limit."""
 _GIVE_UP_AFTER_S = 8.0
-"""Time without a shorter way to a standing goal, after which the robot stands and reports that there is no way."""
+"""Time without progress towards a standing goal, after which the robot stops and reports that there is no way."""
 _KEEP_PLAN_NS = 3_000_000_000
-"""Time for which a path to the goal that is still free is kept when no new one is found."""
+"""Time for which the last path to the goal is kept, while it is free, if no new path is found."""
 _NO_PLAN = no_plan("no plan yet")
 
 
@@ -44,13 +44,13 @@ class NavigatorStep:
 class Navigator:
     """Planner and follower behind one call, with a recovery when the collision monitor blocks the robot.
 
-    A robot that is commanded to move and does not (a corner would touch when it turns, for example) backs off a little
-    and plans again; the next time it moves forwards. The collision monitor also checks these commands.
+    A robot that is commanded to move and does not (because a corner would touch when it turns, for example) backs off a
+    little and plans again; the next time it moves forwards. The collision monitor also checks these commands.
 
-    In a passage hardly wider than the robot, noise opens and closes the way from one plan to the next. When no new path
-    is found, a path to the goal that is still free is therefore kept for ``_KEEP_PLAN_NS``.
+    In a passage hardly wider than the robot, noise opens and closes the way from one plan to the next. If no new path
+    is found, the last path to the goal is therefore kept for ``_KEEP_PLAN_NS`` while it is free.
 
-    A robot that shuttles between ways which turn out to be closed stops, and tries again when a way stays open.
+    A robot that shuttles between ways that turn out to be closed stops, and tries again when a way stays open.
     """
 
     def __init__(self, planner: HybridPlanner, follower: PathFollower, replan_period_s: float = 0.2) -> None:
@@ -69,8 +69,8 @@ class Navigator:
         self._lost = False
         self._plan = _NO_PLAN
         self._planned_ns: int | None = None
-        self._found_ns: int | None = None  # when a path all the way to the goal was last planned
-        self._moved_ns: int | None = None  # when the robot last moved, or had no command to move
+        self._found_ns: int | None = None  # time of the last plan that reached the goal
+        self._moved_ns: int | None = None  # last time at which the robot moved, or had no command to move
         self._moved_pose: NDArray[np.float64] = np.zeros(3)
         self._recovering_ns: int | None = None
         self._direction = -1.0
@@ -84,7 +84,7 @@ class Navigator:
         now_ns: int,
         subgoal_velocity: tuple[float, float] = (0.0, 0.0),
     ) -> NavigatorStep:
-        """Return the twist from ``pose`` to ``subgoal`` (x, y, yaw) in the costmap's frame; zero if not finite."""
+        """Return the twist from ``pose`` to ``subgoal`` (x, y, yaw), in the costmap's frame; zero if one is not finite."""
         if not np.isfinite([*pose, speed_m_s, *subgoal, *subgoal_velocity]).all():
             unknown = replace(self._plan, reached=False, reason="the pose, the subgoal or a speed is not a number")
             return NavigatorStep((0.0, 0.0), "end", unknown, False)
@@ -148,10 +148,10 @@ _MOST_AHEAD_M = 0.2
 def meeting_pose(
     vbot_pose: NDArray[np.float64], shown_pose: NDArray[np.float64], robot_pose: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return the pose (3,) of the r-bot at which the delayed camera image is one taken from the v-bot's place.
+    """Return the goal pose (3,) of the r-bot at which the delayed camera image shows the v-bot's place.
 
-    It lies ahead of the v-bot by the distance that the r-bot, at ``robot_pose``, has driven since ``shown_pose``, where
-    the image was taken that arrives with the next view. When the two meet, nothing is left to ease.
+    The goal lies ahead of the v-bot by the distance between ``shown_pose``, where the image that arrives with the next
+    view was taken, and the r-bot's present ``robot_pose``. At the goal no error remains to be eased.
     """
     ahead = float(relative2(shown_pose, robot_pose)[0])
     lead = min(max(ahead, -_MOST_AHEAD_M), _MOST_AHEAD_M) if math.isfinite(ahead) else 0.0
@@ -159,7 +159,7 @@ def meeting_pose(
 
 
 _AT_VBOT_M = 0.15
-"""A subgoal this near to the v-bot is the v-bot."""
+"""A subgoal nearer to the v-bot than this is the v-bot itself."""
 
 
 def moving_subgoal(
@@ -168,14 +168,14 @@ def moving_subgoal(
     shown_pose: NDArray[np.float64],
     robot_pose: NDArray[np.float64],
 ) -> tuple[NDArray[np.float64], Twist2]:
-    """Return the subgoal (3,) and its velocity; if it is the v-bot, from the v-bot's own newer pose and twist."""
+    """Return the subgoal (3,) and its velocity; at the v-bot: `meeting_pose`, and the v-bot's own twist."""
     if vbot is None or float(np.linalg.norm(vbot[0][:2] - subgoal[:2])) >= _AT_VBOT_M:
         return subgoal, (0.0, 0.0)
     return meeting_pose(vbot[0], shown_pose, robot_pose), vbot[1]
 
 
 def _with_end(plan: Plan, subgoal: NDArray[np.float64]) -> Plan:
-    """Return the plan with its end at the present subgoal, which moves between two plans."""
+    """Return the plan with its last pose at the present subgoal, which may have moved since planning."""
     if not plan.reached or float(np.linalg.norm(plan.poses[-1, :2] - subgoal[:2])) > 0.3:
         return plan
     return replace(plan, poses=np.concatenate([plan.poses[:-1], subgoal[None]]))

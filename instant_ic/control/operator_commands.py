@@ -1,4 +1,4 @@
-"""The operator's commands over time: when he last drove and let go, and whether he holds a control from before."""
+"""The operator's commands over time: last motion, release, and controls held from before an interruption."""
 
 from __future__ import annotations
 
@@ -8,25 +8,26 @@ from instant_ic.control.snapshot import NO_MOTION, ArbiterInputs
 from instant_ic.control.states import Reason
 
 LET_GO_S = 0.1
-"""Seconds of zeros that show that no control is held: the console's last zero is followed at once by its report of the
-loss, and a page that comes back sends a zero before the command of the held key."""
+"""Seconds of zeros that show that no control is held. A single zero is no proof: the console sends one just before it
+reports a lost page, and a page that reconnects sends one before the command of a held key."""
 _MOST_SENDERS = 64
-"""Pages have a new name after each start."""
+"""Largest number of remembered senders: a page has a new name after each start."""
 
 
 class OperatorCommands:
-    """Follows the commands from step to step.
+    """The operator's commands, followed from step to step.
 
     A control that was held while its commands were refused, or when they ended, must be released before it drives
-    again. This binds its sender whenever it comes back; if commands ended, it binds the next operator too. Commands end
-    when none is fresh for too long, or when their sender gives up the lease or restarts. Only senders that send zeros
-    while their operator commands nothing, as the console does, are held to this: silence of another may be a release.
+    again. The rule binds its sender even after a reconnect; if commands ended, it binds the next operator too. Commands
+    end when none is fresh for too long, or when their sender gives up the lease or restarts. The rule applies only to
+    senders that send zeros while their operator commands nothing, as the console does: silence of any other sender may
+    be a release.
 
     Attributes:
         command: m/s, rad/s, within the limits; zero when stale.
-        fresh: the command is not stale, and its client is still there.
+        fresh: the command is not stale, and its client is still connected.
         last: the last command that was not zero.
-        held_by: sender of the last motion, until it has let go; empty if it sends no zeros.
+        held_by: sender of the last motion, until it has let go; empty if that sender sends no zeros.
     """
 
     def __init__(self) -> None:
@@ -36,17 +37,17 @@ class OperatorCommands:
         self._fresh_ns: int | None = None  # time of the last fresh command
         self._driven_ns: int | None = None  # time of the last motion
         self._let_go_ns: int | None = None  # start of the present sender's zeros
-        self._holder = ""  # in the previous step
-        # Senders that must release a control first, and whether they are known to send zeros.
+        self._holder = ""  # holder of the lease in the previous step
+        # Sender that must release a control first -> whether it is known to send zeros.
         self._must_release: dict[str, bool] = {}
-        self._ended = False  # held commands ended, and nobody has let go since
+        self._ended = False  # commands ended while a control was held, and no operator has let go since
 
     def step(
         self, inputs: ArbiterInputs, fresh: bool, limits: MotionLimits, longest_s: float, now_ns: int
     ) -> Notice | None:
-        """Note the command of a step, if it is ``fresh``; return why the controls must be released first, or None.
+        """Record the command of a step if it is ``fresh``; return why the controls must be released first, or None.
 
-        A held control must be released after a silence of ``longest_s``.
+        After a silence of ``longest_s``, a held control must be released.
         """
         self.fresh, self.command = fresh, limits.clip(*inputs.operator_command) if fresh else NO_MOTION
         if self._driven_ns is None:
@@ -55,7 +56,7 @@ class OperatorCommands:
             self._fresh_ns = now_ns
         holder, before = inputs.holder, self._holder
         self._holder = holder
-        # Commands that always arrive late keep a small age, but none is fresh.
+        # If every command arrives late, its age stays small although none is fresh.
         silent_s = 0.0 if fresh else max(inputs.age("command"), (now_ns - self._fresh_ns) / 1e9)
         if self.held_by and (holder != self.held_by or silent_s > longest_s):
             self._ended = True
@@ -86,13 +87,13 @@ class OperatorCommands:
         return 0.0 if self._driven_ns is None else (now_ns - self._driven_ns) / 1e9
 
     def let_go_s(self, now_ns: int) -> float:
-        """Return seconds for which fresh commands have been zero; -1 while they are not, or not fresh."""
+        """Return the seconds for which fresh commands have been zero; -1 while they are stale or not zero."""
         return -1.0 if self._let_go_ns is None else (now_ns - self._let_go_ns) / 1e9
 
     def forget_zeros(self) -> None:
-        """Count the zeros from the next step on: the steps before were not watched."""
+        """Restart the count of zeros at the next step, because the time before it was not watched."""
         self._let_go_ns = None
 
     def hand_back(self, now_ns: int) -> None:
-        """Let the present command be the last one: the operator drives the r-bot from now on."""
+        """Take the present command as the last one, because the operator drives the r-bot from now on."""
         self.last, self._driven_ns = self.command, now_ns

@@ -1,4 +1,4 @@
-"""Age and rate of the images that the operator sees, at the robot and at the page, and where they were taken."""
+"""Age, rate and place of the images that the operator sees, at the robot and at the page."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ from instant_ic.geometry.transforms import TransformBuffer, TransformError
 
 @dataclass(frozen=True)
 class PageReport:
-    """Newest images at the operator's page (ShownPictures)."""
+    """The operator's page's report of its newest images (ShownPictures)."""
 
     image_stamp_ns: int
     """Exposure of the newest camera image; 0: none."""
     image_age_s: float
-    """Seconds since its arrival, when the report was sent."""
+    """Seconds from the image's arrival to the sending of this report."""
     view_id: int
     view_age_s: float
-    """Age of the newest rendered view in seconds, as ``image_age_s``."""
+    """Seconds from the newest view's arrival to the sending of this report."""
     view_delay_s: float
     """Seconds from the request of a view to its arrival."""
     view_position: NDArray[np.float64]
@@ -38,7 +38,7 @@ class PageReport:
 
 
 class OperatorView:
-    """Follows the camera images at the robot and the page's reports. Instants are steady-clock nanoseconds."""
+    """A monitor of the camera images at the robot and of the page's reports. Times are steady-clock nanoseconds."""
 
     def __init__(self, tf: TransformBuffer) -> None:
         self._tf = tf
@@ -46,7 +46,7 @@ class OperatorView:
         self._camera_ns: int | None = None
         self._image: tuple[int, int] = (-1, 0)  # newest camera image at the page: stamp, time of the report
         self._view: tuple[int, int] = (-1, 0)  # newest view there: id, time of the report
-        self._views_wanted = False  # the newest view was requested to be shown
+        self._views_wanted = False  # views were requested for display at the last report
         self.image_delay_s: float | None = None
         """Seconds from a camera image's exposure to its arrival at the page; None: no page yet."""
 
@@ -59,8 +59,8 @@ class OperatorView:
     def report(self, report: PageReport | None, views_wanted: bool, now_ns: int, steady_ns: int) -> bool:
         """Record the page's images; return whether one of them is new.
 
-        ``views_wanted``: each view is requested to be shown. In REAL, views are requested rarely; their distance in
-        time says nothing about their rate.
+        ``views_wanted``: views are requested for display. Otherwise (in REAL) they are requested rarely, so the time
+        between two views says nothing about their rate.
         """
         if report is None:
             return False
@@ -78,19 +78,19 @@ class OperatorView:
         return new
 
     def ages(self, report: PageReport | None, report_age_s: float, steady_ns: int) -> dict[str, float]:
-        """Return the ages of ``camera`` and ``view`` in seconds; with a page, of the images that arrived there."""
+        """Return the ages of ``camera`` and ``view`` in seconds; with a page, the ages of its newest images."""
         camera_s = math.inf if self._camera_ns is None else (steady_ns - self._camera_ns) / 1e9
         if report is None:
             return {"camera": camera_s, "view": math.inf}
         return {"camera": max(camera_s, report.image_age_s + report_age_s), "view": report.view_age_s + report_age_s}
 
     def usual(self, with_page: bool) -> dict[str, float]:
-        """Return the usual ages of ``camera`` and ``view`` in seconds when the next one arrives; inf while unknown."""
+        """Return the usual ages of ``camera`` and ``view`` in seconds at the next arrival; inf while unknown."""
         camera_s = self._camera.usual_s
         return {"camera": max(camera_s, self._page.usual_s) if with_page else camera_s, "view": self._views.usual_s}
 
     def delay_s(self, report: PageReport | None) -> float:
-        """Return seconds until the operator has an image or a view, whichever takes longer."""
+        """Return the delay of an image or of a view until it is at the page, whichever is longer, in seconds."""
         return max(self.image_delay_s or 0.0, 0.0 if report is None else report.view_delay_s)
 
     def shown_pose(
@@ -98,8 +98,8 @@ class OperatorView:
     ) -> NDArray[np.float64] | None:
         """Return the position of the r-bot when the image now shown was taken, with its present heading (3,).
 
-        A view of this pose is shown when the next images have arrived, so the pose lies ahead by the delay of a view.
-        None without a page, or while ``pose`` is unknown.
+        "Now" is when a view requested at this moment will be shown, so the pose lies ahead by the delay of a view. None
+        without a page, or while ``pose`` is unknown.
         """
         if report is None or pose is None or self.image_delay_s is None:
             return None

@@ -19,12 +19,12 @@ from instant_ic.control.walls import WallMap
 
 @dataclass(frozen=True)
 class PassageConfig(Checked):
-    """How soon free space must follow behind the obstacle, and how long the detour may be.
+    """Limits on the obstacle's depth and on the length of the detour.
 
     Attributes:
-        max_pass_m: m; largest distance behind the obstacle at which free space must begin, for a switch to the v-bot
-            and for a subgoal.
-        max_detour_m: m; how much longer than straight on the way round may be.
+        max_pass_m: m; free space must begin within this distance behind the obstacle, for a switch to the v-bot and for
+            a subgoal.
+        max_detour_m: m; largest additional length of the way round, compared with the straight line.
     """
 
     max_pass_m: NotNegative = 3.0
@@ -39,10 +39,10 @@ def find_passage(
     planner: HybridPlanner,
     config: PassageConfig,
 ) -> Notice | None:
-    """Return the reason why the r-bot cannot get behind the obstacle ahead; None when it can.
+    """Return why the r-bot cannot get behind the obstacle ahead; None if it can.
 
-    Looks straight on from where the predicted trajectory meets the obstacle, then plans a way there.
-    The first place behind it that is free, or not seen yet, must come before any wall. The path to it may be at most
+    The search starts where the predicted trajectory meets the obstacle and goes straight on. The first place behind it
+    that is free, or not seen yet, must come before any wall. The planned path to that place may be at most
     ``max_detour_m`` longer than the straight line.
     """
     if prediction.hit_index is None:

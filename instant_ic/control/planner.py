@@ -3,12 +3,12 @@
 `HybridPlanner.plan`:
 
 1. ``_PlannerGrid``: price of one cell length in each cell, distance to the nearest obstacle, footprint at each heading.
-2. ``connected``, ``nearest``: the goal, or the nearest place to it that the robot can reach.
-3. ``cost_to_go``: cost of the point robot's way to the goal over the same prices (Dijkstra); the search's heuristic.
+2. ``connected``, ``nearest``: the goal, or the reachable place nearest to it.
+3. ``cost_to_go``: cost of a point robot's way to the goal at the same prices (Dijkstra); the search's heuristic.
 4. ``search``: hybrid A*. Each pose is continued by arcs, turns on the spot and reverse arcs, as long as the footprint
    meets nothing; a straight line to the goal ends it.
 5. ``smooth``: runs of poses become straight lines where these cost no more.
-6. ``_resample``, ``_before_unknown``: poses 5 cm apart, which end before the first unseen cell.
+6. ``_resample``, ``_before_unknown``: poses 5 cm apart, up to the first unseen cell.
 
 Source: Dolgov, Thrun, Montemerlo, Diebel: Path planning for autonomous vehicles in unknown semi-structured
 environments, IJRR 29(5), 2010; primitives and collision checks for a skid-steer rectangle instead of a car.
@@ -40,7 +40,7 @@ SPACING_M = 0.05
 BINS = 32
 """Headings per full turn in the search."""
 TOLERANCE_M = 0.5
-"""A path that ends this near an occupied goal counts as a way."""
+"""A path that ends this near to an occupied goal counts as a way to it."""
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,7 @@ class PlannerTuning:
         footprint_padding: padding of the footprint, in metres.
         cost_penalty: extra price of a metre at cost 252; higher: longer paths, farther from obstacles.
         tight_cost: cost above which the robot cannot turn on the spot (0.39 m from obstacles).
-        tight_penalty: further price of a metre above that, at cost 252.
+        tight_penalty: additional price of a metre above tight_cost, at cost 252.
         unknown_penalty: extra price of a metre through unseen cells.
         unknown_standoff_m: distance that the path keeps to unseen cells.
         retrospective_gain: discount along the previous path, which keeps the chosen side.
@@ -60,10 +60,10 @@ class PlannerTuning:
         curve_penalty: price factor of a metre on a curve.
         change_penalty_m: price of a change of direction.
         rotation_penalty_m: price of one radian turned on the spot.
-        escape_radius_m: how far a robot that stands on obstacles may drive to get off them.
-        closed_weight: price factor of cells that are closed, except for a robot that stands in them.
-        cost_to_go_weight: weight of the cost-to-go (weighted A*, Pohl 1970): paths cost at most this factor more, but
-            come sooner.
+        escape_radius_m: largest distance that a robot standing on obstacles may drive to get off them.
+        closed_weight: price factor of closed cells, which only a robot that stands in them may cross.
+        cost_to_go_weight: weight of the cost-to-go (weighted A*, Pohl 1970): the search is faster, and paths cost at
+            most this factor more.
     """
 
     footprint_padding: float = 0.02
@@ -88,19 +88,19 @@ TUNING = PlannerTuning()
 
 @dataclass(frozen=True)
 class Plan:
-    """A path and how far it leads."""
+    """A path, and whether it leads to the goal."""
 
     poses: NDArray[np.float64]
     """(N, 3) x, y, yaw in the map frame, at most 5 cm apart; empty when there is no way at all. A turn on the spot is
     a run of poses at one place."""
     reached: bool
-    """The path ends at the goal (not in front of something)."""
+    """The path ends at the goal, not in front of an obstacle or unseen space."""
     reason: str
-    """Reason why the path does not end at the goal; empty when it does."""
+    """Reason why the path does not end at the goal; empty if it does."""
     whole_length_m: float
     """Length to the goal, including the part through unknown space; inf when there is no way."""
     reverse: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(0, dtype=bool))
-    """(N,) whether the robot reaches a pose backwards."""
+    """(N,) true for poses that the robot reaches backwards."""
 
 
 def no_plan(reason: str) -> Plan:
@@ -109,19 +109,19 @@ def no_plan(reason: str) -> Plan:
 
 
 class HybridPlanner:
-    """Finds paths for the true footprint from any pose of the robot.
+    """A planner of paths for the true footprint from any pose of the robot; `PlannerTuning` lists the prices.
 
     A step costs its length times (1 + cost_penalty·cost/252). Above ``tight_cost``, where the robot cannot turn on the
     spot, up to ``tight_penalty`` is added. Reversing, changing direction and turning cost more.
+
     No pose puts the footprint (with ``footprint_padding``) on a lethal cell. A robot that stands on lethal cells may
     leave them, but never go deeper. A way may cross unknown cells, but the path ends ``unknown_standoff_m`` before the
     first of them: the robot drives up, sees more, and plans again. Cells near the previous path are a little cheaper
-    (``retrospective_gain``), so that the planner does not alternate between two equally good ways. (Prices:
-    `PlannerTuning`.)
+    (``retrospective_gain``), so that the planner does not alternate between two equally good ways.
     """
 
     def __init__(self, footprint: Footprint | None = None, max_iterations: int = 5000) -> None:
-        """Plan for a footprint; a search gives up after ``max_iterations`` poses."""
+        """Make a planner for a footprint; a search gives up after ``max_iterations`` poses."""
         self.footprint, self.max_iterations = footprint or Footprint(), max_iterations
 
     def plan(
@@ -151,7 +151,7 @@ class HybridPlanner:
         reachable = bool(connected[near])
         target = goal
         if taken or outside or not reachable:
-            # Plan to the nearest reachable place that has been seen.
+            # Plan to the reachable, known place nearest to the goal.
             near = grid.nearest(connected, (row, column), near)
             place = costmap.centres(np.array(near[0]), np.array(near[1]))
             target = np.array([place[0], place[1], np.nan])
@@ -184,16 +184,16 @@ class HybridPlanner:
         return f"no way to the goal: obstacles close it off {gap_m:.1f} m before it"
 
     def _at_the_goal(self, start: NDArray[np.float64], goal: NDArray[np.float64]) -> Plan:
-        # The robot may stand at the goal already, inside the inflation.
+        # The robot may already be at the goal, inside the inflation.
         back = (goal[:2] - start[:2]) @ np.array([math.cos(start[2]), math.sin(start[2])]) < 0.0
         return Plan(np.stack([start, goal]), True, "", _length(np.stack([start, goal])), np.array([False, back]))
 
 
 def _before_unknown(costmap: Costmap, poses: NDArray[np.float64]) -> NDArray[np.bool_] | None:
-    """Return the mask of the poses of a path before the first unknown cell; None when it crosses none."""
+    """Return the mask (N,) of the poses before the path's first unknown cell; None if it crosses none."""
     costs = costmap.cost_at(poses[:, :2])
     from_start = np.linalg.norm(poses[:, :2] - poses[0, :2], axis=1)
-    # The scan sees nothing close to the robot; the cells under it are free.
+    # The scan sees nothing close to the robot, so unknown cells there do not count.
     unknown = np.flatnonzero((costs == UNKNOWN) & (from_start > TUNING.unknown_standoff_m))
     if unknown.size == 0:
         return None
@@ -223,20 +223,20 @@ class _PlannerGrid:
         tight = (TUNING.tight_cost, TUNING.tight_penalty)
         unknown = 1.0 + TUNING.unknown_penalty
         self.weights = cell_weights(costmap.costs, near, unknown, TUNING.cost_penalty, tight, TUNING.retrospective_gain)
-        # The body in cells at each heading, filled: posts inside the outline count too. At a spacing of 0.7 cells
+        # The footprint is filled with points, because posts inside the outline count too. At a spacing of 0.7 cells,
         # every cell whose middle is covered holds a point.
         body = planner.footprint.points(0.7 * costmap.resolution, TUNING.footprint_padding) / costmap.resolution
         body = body[np.argsort(-(body**2).sum(axis=1), kind="stable")]
         yaw = 2.0 * math.pi * np.arange(BINS) / BINS
         c, s = np.cos(yaw)[:, None], np.sin(yaw)[:, None]
         bodies = np.stack([c * body[:, 0] - s * body[:, 1], s * body[:, 0] + c * body[:, 1]], axis=-1)
-        # A pose may lie anywhere in its cell: nothing can touch from 0.71 cells farther on.
+        # A pose may lie anywhere in its cell, up to 0.71 cells from the centre: contact is impossible only beyond that.
         reach = planner.footprint.circumscribed_radius_m + 1.5 * TUNING.footprint_padding
         reach = reach / costmap.resolution + 1.42
         self.map = GridMap(costmap.costs, self.weights, self.clearance, np.ascontiguousarray(body), bodies, reach)
 
     def connected(self, row: int, column: int) -> NDArray[np.bool_]:
-        """Return the mask (H, W) of the cells that the robot's centre can reach from one."""
+        """Return the mask (H, W) of the cells that the robot's centre can reach from cell (row, column)."""
         import cv2
 
         open_ = (self.weights > 0).astype(np.uint8)
@@ -258,9 +258,9 @@ class _PlannerGrid:
         return reached
 
     def nearest(self, connected: NDArray[np.bool_], start: tuple[int, int], goal: tuple[int, int]) -> tuple[int, int]:
-        """Return the reachable, known cell nearest to the goal in which the robot may face any way except along a wall.
+        """Return the reachable, known cell nearest to the goal that has room for the robot at nearly every heading.
 
-        That is the start where none is nearer.
+        Return the start if no such cell is nearer.
         """
         half = 0.5 * max(self.planner.footprint.length_m, self.planner.footprint.width_m)
         room = (half + TUNING.footprint_padding) / self.costmap.resolution + 0.5
@@ -313,7 +313,7 @@ def _length(poses: NDArray[np.float64]) -> float:
 def _resample(
     nodes: NDArray[np.float64], start: NDArray[np.float64], goal: NDArray[np.float64] | None
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """Return poses at most ``SPACING_M`` apart along nodes (N, 4), from start to goal; and which are backwards."""
+    """Return poses at most ``SPACING_M`` apart along nodes (N, 4), and a mask of those that are reached backwards."""
     nodes = nodes.copy()
     nodes[0, :3] = start
     if goal is not None:
@@ -326,7 +326,7 @@ def _resample(
         part = (np.arange(1, count + 1) / count)[:, None]
         piece = np.empty((count, 3))
         piece[:, :2] = a[:2] + step * part
-        # On a straight line the robot turns before it drives; on an arc it turns on the way.
+        # On a straight line the robot turns before it drives; on an arc it turns while it drives.
         along = math.atan2(step[1], step[0]) + math.pi * b[3]
         straight = length > 1e-6 and abs(math.remainder(b[2] - along, 2 * math.pi)) < 1e-3
         piece[:, 2] = b[2] if straight else a[2] + math.remainder(b[2] - a[2], 2 * math.pi) * part[:, 0]

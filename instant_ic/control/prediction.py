@@ -20,7 +20,7 @@ _along_arc = njit(cache=True)(along_arc)
 _step_towards = njit(cache=True)(step_towards)
 
 _YAW_MARGIN_RAD = 0.4
-"""Margin when turning on the spot, in place of ``margin_m``."""
+"""Margin when turning on the spot, where ``margin_m`` does not apply."""
 _MAX_HORIZON_S = 8.0
 """Longest prediction, however slow the robot."""
 STEP_S = 0.05
@@ -33,7 +33,7 @@ class PredictionConfig(Checked):
 
     Attributes:
         latency_s: s; delay from a command to the base's response.
-        margin_m: m; horizon beyond the stopping distance; higher: earlier switch to the v-bot.
+        margin_m: m; horizon beyond the stopping distance; a larger one switches to the v-bot earlier.
         padding_m: m round the footprint.
     """
 
@@ -49,9 +49,9 @@ class Prediction:
     poses: NDArray[np.float64]
     """(N, 3) x, y, yaw in the map frame, now and every ``STEP_S``."""
     hit_index: int | None
-    """First pose whose footprint overlaps more obstacle than at the start; None when the way is free."""
+    """Index of the first pose whose footprint overlaps more obstacles than at the start; None if the way is free."""
     distance_m: float
-    """Distance that the robot's farthest corner travels until then; inf when free."""
+    """Distance that the robot's farthest corner travels to that pose; inf if the way is free."""
 
     @property
     def time_to_obstacle_s(self) -> float:
@@ -65,10 +65,10 @@ def stopping_distance(speed_m_s: float, limits: MotionLimits, latency_s: float) 
 
 
 class Predictor:
-    """Rolls a command out with the base's latency and acceleration limits.
+    """A prediction of motion under a command, with the base's latency and acceleration limits.
 
-    The horizon is a length, not a time: the stopping distance at the commanded (or measured, if higher) speed plus a
-    margin. It is measured at the footprint's farthest corner, so it also covers turning on the spot.
+    The horizon is a length, not a time: the stopping distance at the commanded speed (or the measured one, if higher)
+    plus a margin. It is measured at the footprint's farthest corner, so it also covers turning on the spot.
     """
 
     def __init__(self, config: PredictionConfig, limits: MotionLimits, footprint: Footprint) -> None:
@@ -79,7 +79,7 @@ class Predictor:
         self.body = footprint.points(0.045, config.padding_m)
 
     def horizon(self, linear: float, angular: float) -> float:
-        """Return metres for which the farthest corner is followed at a speed of (m/s, rad/s)."""
+        """Return the distance in metres over which the farthest corner is followed at a twist (m/s, rad/s)."""
         speed = abs(linear) + self.reach_m * abs(angular)
         if speed == 0.0:
             return 0.0
@@ -102,7 +102,7 @@ class Predictor:
         costmap the way is free.
         """
         command = self.limits.clip(*command)
-        # Delayed encoder readings can give a speed that the base cannot drive: the horizon would be metres too long.
+        # Delayed encoder readings can give an impossible speed, which would make the horizon metres too long.
         velocity = self.limits.clip(*velocity)
         faster = command if _speed(command, self.reach_m) >= _speed(velocity, self.reach_m) else velocity
         length = self.horizon(*faster)
@@ -123,7 +123,7 @@ class Predictor:
             if side_m > 0:
                 body = self.footprint.points(0.045, self.config.padding_m + side_m)
             overlap = costmap.lethal_overlap(path, body)
-            # A robot that stands on an obstacle already (after a map jump) must not be blocked for good.
+            # A robot that stands on an obstacle already (after a map jump) must not be blocked forever.
             worse = np.flatnonzero(overlap > overlap[0])
             hit = int(worse[0]) if worse.size else None
         return Prediction(path, hit, math.inf if hit is None else float(travelled[hit]))
@@ -143,7 +143,7 @@ def _roll_out(
     length_m: float,
     reach_m: float,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the poses (N, 3) under a command, and how far the farthest corner has travelled at each, (N,).
+    """Return the poses (N, 3) under a command, and the distance travelled by the farthest corner at each, (N,).
 
     The steps are those of ``kinematics.accelerate`` and ``move``. The command takes effect after ``late_steps``, and
     changes the velocity by at most ``steepest`` (2,) per step.

@@ -14,28 +14,28 @@ _NEARER_M = 0.2
 _OTHER_WAY_M = 1.0
 """A path that is this much longer counts as another way."""
 _OTHER_WAYS = 2
-"""Longer ways that are tried to one goal; after them, only a new shortest way is progress."""
+"""Number of longer ways tried to one goal; after these, only a new shortest way is progress."""
 _SAME_GOAL_M = 0.5
 _NO_WAY_M = 1000.0
-"""A path that does not end at the goal counts as this much longer: a way to the goal is always progress."""
+"""A path that does not end at the goal counts as this much longer, so that a way to the goal is always progress."""
 
 
 class Progress:
-    """Watches the length of the path to one goal. The time is the clock's, not a number of plans."""
+    """A monitor of the length of the path to one goal. Time is measured by the clock, not in plans."""
 
     def __init__(self, patience_s: float) -> None:
         self.patience_s = patience_s
         self.reset()
 
     def reset(self) -> None:
-        """Forget the goal, as when it was reached."""
+        """Forget the goal, for example when it was reached."""
         self._goal: NDArray[np.float64] | None = None
         self._best_m, self._nearer_ns, self._ways = math.inf, 0, 0
         self._free_since_ns: int | None = None
         self._given_up = 0
 
     def lost(self, plan: Plan, pose: NDArray[np.float64], goal: NDArray[np.float64], now_ns: int) -> bool:
-        """Note the newest plan from ``pose`` to ``goal`` (3,); return whether it makes no progress for ``patience_s``.
+        """Record the newest plan from ``pose`` to ``goal`` (3,); return whether none made progress for ``patience_s``.
 
         After that, a way must stay open for some time, longer each time, before it is tried again.
         """

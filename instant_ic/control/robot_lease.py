@@ -1,4 +1,4 @@
-"""Lease of the right to drive: one sender at a time, and no start under a control that was held before."""
+"""Lease of the right to drive: one sender at a time, who must release a control held from before first."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import NamedTuple
 from instant_ic.util.diagnosis import Diagnosis, Level
 
 RELEASED = " released"
-"""Ending of the name of a sender that gives the lease back; its command is zero."""
+"""Suffix of a sender's name with which it gives the lease back; its command is zero."""
 
 LEASE_S = 2.0
 """Silence in seconds after which the holder of the robot's lease counts as lost."""
@@ -16,7 +16,7 @@ _MOST_CHARACTERS = 64
 
 
 class Verdict(Enum):
-    """Result of the check of a command; the value is a text for the operator."""
+    """Result of checking a command; the value is the text for the operator."""
 
     ACCEPTED = "The command is accepted."
     NOT_FINITE = "The command is not a number."
@@ -36,23 +36,23 @@ class Verdict(Enum):
 
 
 class Refusal(NamedTuple):
-    """Why a command may not drive: a verdict to decide and count by, and a text with the details."""
+    """Reason why a command may not drive: a verdict for decisions and counts, and a text with the details."""
 
     verdict: Verdict
     text: str
 
 
 def sender_name(*parts: str) -> str:
-    """Return a sender's name from its gateway, host and client; a part from outside cannot pass for two."""
+    """Return a sender's name from its gateway, host and client. A part from outside cannot imitate two parts."""
     cleaned = ("".join(c if c.isprintable() and c != "/" else "_" for c in part) for part in parts)
     return "/".join(part[:_MOST_CHARACTERS] for part in cleaned)
 
 
 class Lease:
-    """Right to drive of one sender. Another one gets it after the holder has released it or was silent.
+    """Right of one sender to drive. Another sender gets it after the holder has released it or was silent.
 
-    A sender that takes over must let go of the controls first: send zero, or nothing for ``silent_s``. Else the robot
-    would start under a key whose commands were refused until then. Times are nanoseconds of a clock that is never set.
+    A sender that takes over must let go of the controls first, by sending zero, or nothing for ``silent_s``. Otherwise
+    a key whose commands were refused so far would suddenly drive the robot. Times are nanoseconds of a steady clock.
 
     Args:
         silent_s: silence in seconds after which the holder counts as lost.
@@ -68,7 +68,7 @@ class Lease:
         self._held: dict[str, int] = {}  # sender -> time of its last motion that was refused
 
     def refusal(self, sender: str, moves: bool, now_ns: int, stands: bool = True) -> Refusal | None:
-        """Note a command, which ``moves`` or is zero; return why its sender may not drive, None if he may (`grant`).
+        """Record a command, zero unless ``moves``; return why its sender may not drive, or None if it may (`grant`).
 
         The lease passes to another sender only while the robot ``stands``.
         """
@@ -93,7 +93,7 @@ class Lease:
         self.holder, self._heard_ns = sender, now_ns
 
     def release(self, sender: str) -> bool:
-        """End a sender's lease; return whether it had it."""
+        """End a sender's lease; return whether the sender had it."""
         if not self.holder or sender != self.holder:
             return False
         self.holder = ""
@@ -111,12 +111,12 @@ class Lease:
 
     @property
     def refused(self) -> tuple[str, ...]:
-        """Senders whose motion was refused lately."""
+        """Senders whose motion was refused recently."""
         return tuple(self._held)
 
     @property
     def diagnosis(self) -> Diagnosis:
-        """Who drives; a warning while others try to."""
+        """The present driver; a warning while others try to drive."""
         text = f"{self.holder or 'nobody'} drives"
         if self._held:
             return Diagnosis("operator", Level.WARN, f"{text}; refused: {', '.join(sorted(self._held)[:3])}")
@@ -126,7 +126,7 @@ class Lease:
 def may_release_estop(publisher: str, holder: str) -> str:
     """Return why the node ``publisher`` may not release the emergency stop.
 
-    Empty if it may: one of its clients is ``holder`` of the robot's lease (``node/client``; empty: nobody).
+    Empty if it may, because one of its clients is the ``holder`` of the robot's lease (``node/client``; empty: nobody).
     """
     if holder.startswith(f"{publisher}/"):
         return ""

@@ -1,8 +1,8 @@
 """Collision monitor: the last step before ``/cmd_vel`` (after nav2_collision_monitor).
 
-It checks the newest scan and 3D points against the true footprint, on the path that the robot takes from its present
-speed to the commanded one. The caller adds the costmap's memory (``blind_radius_m``, ``memory_range_m``) of things that
-are too near or too low to be seen, and people with their velocity (``moving.py``).
+It checks the newest scan and 3D points against the true footprint, on the path of the robot from its present speed to
+the commanded one. The caller adds things that are too near or too low to be seen, from the costmap's memory
+(``blind_radius_m``, ``memory_range_m``), and people with their velocity (``moving.py``).
 """
 
 from __future__ import annotations
@@ -31,12 +31,12 @@ STEP_S = 0.05
 
 @dataclass(frozen=True)
 class PolygonConfig(Checked):
-    """The padded footprint, and what happens when something is inside.
+    """A padded footprint that is checked for points inside.
 
     Attributes:
-        enabled: whether the polygon is checked.
+        enabled: check the polygon.
         padding_m: m round the footprint.
-        min_points: number of points inside from which on the region counts as occupied.
+        min_points: smallest number of points inside at which the polygon counts as occupied.
     """
 
     enabled: bool = True
@@ -63,7 +63,7 @@ class ApproachConfig(PolygonConfig):
     Attributes:
         time_before_collision: seconds to contact below which the command is slowed in proportion.
         stop_time_s: seconds to contact at which the command becomes zero.
-        moving_stop_time_s: the same for contact with a person or another moving thing: the robot stands by then.
+        moving_stop_time_s: as stop_time_s, for a person or another moving thing; the robot has stopped by the contact.
     """
 
     padding_m: Annotated[float, Plausible(0, 2)] = 0.04
@@ -84,11 +84,11 @@ class CollisionMonitorConfig(Checked):
 
     Attributes:
         source_timeout: s; older scans or points stop the robot.
-        blind_radius_m: m; the LiDAR sees nothing nearer than this; the costmap's lethal cells are used instead; 0: off.
-        memory_range_m: m; marks of 3D points count up to here, whether seen at present or not; 0: off.
-        stop: something inside, and the command leads deeper: zero.
-        slowdown: something inside: slower.
-        approach: footprint makes contact within time_before_collision: slowed in proportion.
+        blind_radius_m: m; nearer than this the LiDAR sees nothing, and the costmap's lethal cells count; 0: off.
+        memory_range_m: m; marks of 3D points count within this range, even if no sensor sees them now; 0: off.
+        stop: command zero while something is inside and the command leads deeper.
+        slowdown: slower command while something is inside.
+        approach: command slowed in proportion before a contact within time_before_collision.
     """
 
     source_timeout: Annotated[float, Plausible(0.05, 2)] = 0.5
@@ -122,17 +122,17 @@ class _Polygon:
     name: str
     config: PolygonConfig
     normals: NDArray[np.float64]
-    """(E, 2) outward."""
+    """(E, 2) outward normals of the edges."""
     offsets: NDArray[np.float64]
-    """(E,) of the edges along their normals; inside: normals @ point < offsets."""
+    """(E,) distances of the edges from the origin; a point is inside if normals @ point < offsets."""
     reach: float
 
 
 class CollisionMonitor:
-    """Reduces a command to what every polygon allows.
+    """The check that reduces a command to the share that every polygon allows.
 
-    Linear and angular speed are cut by one factor, so that the robot stays on the checked arc. A robot in contact may
-    move so that the contact gets smaller: ``stop`` and ``approach`` block only motion that goes deeper.
+    Linear and angular speed are reduced by one factor, so that the robot stays on the checked arc. A robot in contact
+    may move so that the contact gets smaller: ``stop`` and ``approach`` block only motion that goes deeper.
     """
 
     def __init__(
@@ -143,7 +143,7 @@ class CollisionMonitor:
         self.limits = limits or MotionLimits()
         self._polygons = [_polygon(name, polygon, footprint) for name, polygon in config.polygons().items()]
         self.most_points_needed = max((p.config.min_points for p in self._polygons), default=1)
-        """A cell of memory must count as that many points for every polygon to notice it."""
+        """Number of points by which a cell of memory must be represented for every polygon to notice it."""
 
     def limit(
         self,
@@ -157,10 +157,10 @@ class CollisionMonitor:
 
         Args:
             command: the requested command.
-            points: (N, 2) points seen, in ``base_link`` at present.
+            points: (N, 2) points seen, in ``base_link`` at the robot's present pose.
             source_age_s: age of the oldest required source of the points.
-            velocity: present twist of the robot; None: it moves as commanded already.
-            moving: points of people and other moving things, in ``base_link`` at present.
+            velocity: present twist of the robot; None: it already moves as commanded.
+            moving: points of people and other moving things, in ``base_link`` at the robot's present pose.
         """
         linear, angular = command
         if not all(map(math.isfinite, (linear, angular, *(velocity or ())))):
@@ -169,7 +169,7 @@ class CollisionMonitor:
             return MonitoredCommand(command, "free", math.inf)
         if not source_age_s <= self.config.source_timeout:
             return MonitoredCommand((0.0, 0.0), "stop", 0.0, "source_timeout")
-        # Check from the commanded twist and from the present one: to slow down or to turn away takes time.
+        # Check from the commanded twist and from the present one, because slowing down or turning away takes time.
         starts = {command, command if velocity is None else velocity}
         standing = MovingPoints(points, np.zeros_like(points))
         factor, action, decided, soonest = 1.0, "free", "", math.inf
@@ -190,9 +190,9 @@ class CollisionMonitor:
         seen: MovingPoints,
         moving: bool,
     ) -> tuple[float, float]:
-        """Return the share of the command that one polygon allows from the twist ``start``, and the time to collision.
+        """Return the share of the command that a polygon allows from the twist ``start``, and the time to collision.
 
-        The time is inf where it is not computed.
+        The time is inf if the polygon does not need it.
         """
         config = polygon.config
         looks_ahead = not isinstance(config, SlowdownConfig)
@@ -257,9 +257,9 @@ def _time_to_collision(
     horizon: float,
     min_points: int,
 ) -> float:
-    """Start of the first step in which at least ``min_points`` points enter the polygon (or go deeper).
+    """Return the start in seconds of the first step in which ``min_points`` points enter the polygon or go deeper.
 
-    The robot accelerates from ``twists[0]`` to ``twists[1]``, the points (N, 2) move at ``velocities``.
+    The robot accelerates from ``twists[0]`` to ``twists[1]``; the points (N, 2) move at ``velocities``.
     """
     depth = np.empty(points.shape[0])
     for j in range(points.shape[0]):

@@ -1,4 +1,4 @@
-"""Inputs of the arbiter and the snapshot of one step, on which guards and commands decide."""
+"""Inputs of the arbiter, and the snapshot of one step by which guards and commands decide."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class Vspace:
     training: bool = False
     failed: bool = False
     position: NDArray[np.float64] = field(default_factory=lambda: np.zeros(2))
-    """(2,) position of the newest keyframe in the map frame."""
+    """(2,) position of the newest keyframe in the map frame, in metres."""
     ready_radius_m: float = 0.0
     message: str = ""
     expected_psnr_db: float = 0.0
@@ -53,24 +53,24 @@ class ArbiterInputs:
     robot_velocity: Twist2 = (0.0, 0.0)
     operator_command: Twist2 = (0.0, 0.0)
     holder: str = ""
-    """Sender who has the robot's lease; empty: nobody."""
+    """Sender that has the robot's lease; empty: nobody."""
     holder_sends_zeros: bool = False
-    """True if this sender has sent zeros, so that its silence is no release."""
+    """The holder has sent zeros before, so that its silence is no release."""
     refused: tuple[str, ...] = ()
-    """Senders without the lease who hold a control."""
+    """Senders without the lease that hold a control."""
     operator_gone: bool = False
-    """The client that sent the command has left since: the command is void, whatever its age."""
+    """The client that sent the command has left since. The command is void, whatever its age."""
     held_in_vain: bool = False
-    """True if nobody drives because a client must release its controls first."""
+    """Nobody drives, because a client must release its controls first."""
     estop: bool = False
     estop_button: bool = False
     """The button on the robot is pressed; only releasing it ends the stop."""
     estop_why: str = ""
-    """Text for the operator of a stop that nobody pressed in this run; empty: the usual text."""
+    """Text for the operator about a stop that was not pressed in this run; empty: the usual text."""
     scan_points: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 2)))
     """(N, 2) hits of the newest scan and 3D points in ``base_link``, at the robot's present pose."""
     blind: tuple[bool, bool] = (False, False)
-    """LiDAR covered ahead, and behind: it measures nothing where it did before."""
+    """Flags (ahead, behind) of a covered LiDAR, which measures nothing where it did before."""
     moving: MovingPoints = NOTHING_MOVES
     """People and other moving things, in ``base_link`` at the robot's present pose."""
     costmap: Costmap | None = None
@@ -81,17 +81,17 @@ class ArbiterInputs:
     vbot_velocity: Twist2 = (0.0, 0.0)
     nav_command: Twist2 = (0.0, 0.0)
     shown_pose: NDArray[np.float64] | None = None
-    """(3,) position of the r-bot when the camera image now shown was taken, with its present heading, to which the page
-    turns each image; None: ``robot_pose``."""
+    """(3,) position of the r-bot when the camera image now shown was taken, with the present heading, because the page
+    turns each image to it; None: ``robot_pose``."""
     image_position: NDArray[np.float64] | None = None
     """(2,) position of the camera in the map frame for the newest image that the operator has."""
     view_position: NDArray[np.float64] | None = None
     """(2,) position of the camera in the map frame for the newest rendered view that the operator has."""
     view_after_image_s: float = 0.0
-    """Seconds from the arrival of that image to the arrival of that view."""
+    """Seconds from the arrival of the newest image to the arrival of the newest view."""
     ages: dict[str, float] = field(default_factory=dict)
-    """Seconds since the last message of: scan, odometry, pose, camera, view, vbot, nav, command, vspace; points and
-    estop_input from their first message on."""
+    """Seconds since the last message of scan, odometry, pose, camera, view, vbot, nav, command and vspace; also of
+    points and estop_input, from their first message on."""
     usual: dict[str, float] = field(default_factory=dict)
     """Usual age of a source in seconds when its next message arrives (``freshness.Rhythm``)."""
     suspended_ns: int = 0
@@ -99,7 +99,7 @@ class ArbiterInputs:
     instances: dict[tuple[str, str], bytes] = field(default_factory=dict)
     """Identity of each publisher (``Received.instance``) by source and node."""
     images_late_s: float = 0.0
-    """Seconds until the operator has an image, from its exposure, or from the view's request if that takes longer."""
+    """Delay in seconds of an image from exposure to the page, or of a view from its request to the page if longer."""
 
     def age(self, key: str) -> float:
         """Return the age of a source in seconds; inf before its first message."""
@@ -108,7 +108,7 @@ class ArbiterInputs:
 
 @dataclass(frozen=True)
 class Snapshot:
-    """Everything that guards and commands of one step may look at; nothing changes it."""
+    """The immutable state by which guards and commands of one step decide."""
 
     config: ArbiterConfig
     predictor: Predictor
@@ -119,11 +119,11 @@ class Snapshot:
     command: Twist2
     """The operator's command; zero when stale."""
     fresh: bool
-    """The operator's command is not stale, and its client is still there."""
+    """The operator's command is not stale, and its client is still connected."""
     last_command: Twist2
     """The operator's last command that was not zero."""
     idle_s: float
-    """Seconds since that command."""
+    """Seconds since the last command that was not zero."""
     stale: tuple[Stale, ...]
     """Stale sources that the present mode needs."""
     lost: tuple[Stale, ...]
@@ -153,13 +153,13 @@ class Snapshot:
     slow_s: float
     """Seconds for which the v-bot has driven slower than commanded."""
     let_go_s: float
-    """Seconds for which fresh commands have been zero; -1 while they are not, or not fresh."""
+    """Seconds for which fresh commands have been zero; -1 while they are stale or not zero."""
     held: bool = False
-    """True while the sender of the last motion has not let go: his silence is no release."""
+    """The sender of the last motion has not let go yet; its silence is no release."""
     interrupted: Notice | None = None
-    """Event since the previous step after which the controls must be released; None without one."""
+    """Event since the previous step after which the controls must be released; None if there was none."""
     settles: bool = False
-    """The arbiter itself stood still, less than ``SETTLE_S`` ago."""
+    """The arbiter did not run for a while, and has run again for less than ``SETTLE_S``."""
     pose_lost: bool = False
     """The SLAM is lost, and the robot has not been stopped for it yet."""
     pose_jumped: bool = False
@@ -169,12 +169,12 @@ class Snapshot:
     vbot_jumped: bool = False
     """The v-bot's pose has jumped: the r-bot would follow it to a place where nobody drove it."""
     no_view_fits: bool = False
-    """An entry was abandoned, and neither has a view fitted since nor has the operator let go."""
+    """An entry was abandoned. Since then no view has fitted, and the operator has not let go."""
     leading_back: bool = False
     """The v-bot returns to the r-bot by itself."""
     subgoal: Subgoal | None = None
     against_switch: Notice | None = None
-    """Reason against a switch in REAL with an obstacle ahead; None if there is none."""
+    """Reason why no switch is possible in REAL with an obstacle ahead; None if one is, or no obstacle is ahead."""
 
     @property
     def pose_doubtful(self) -> bool:
@@ -183,7 +183,7 @@ class Snapshot:
 
     @property
     def must_be_slow(self) -> bool:
-        """True if the r-bot must drive slowly: its pose, or its motion, may be wrong."""
+        """True if the r-bot must drive slowly because its pose or its measured motion may be wrong."""
         return self.pose_doubtful or self.inputs.contradiction != Contradiction.NONE
 
     @property

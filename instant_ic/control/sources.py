@@ -1,4 +1,4 @@
-"""Which sources a mode needs, which of them are stale, and how fast their rates let the robot drive."""
+"""Sources that a mode needs: their freshness, and the speed that their rates allow."""
 
 from __future__ import annotations
 
@@ -12,7 +12,8 @@ from instant_ic.control.snapshot import ArbiterInputs
 from instant_ic.control.states import SOURCES, Mode, Source
 
 STEP_AFTER_S = 0.001
-"""Delay of a step after the time-out that it checks, so that the source is stale; time-outs are shorter by as much."""
+"""Delay of a step after the time-out that it checks, so that the source is surely stale; time-outs are shortened by it.
+"""
 _CATCH_UP = 0.8
 """Speed limit of the v-bot as a share of the r-bot's."""
 
@@ -26,16 +27,16 @@ class SourceMonitor:
     def stale(
         self, inputs: ArbiterInputs, mode: Mode, in_mode_s: float, shown_s: float = math.inf
     ) -> tuple[Stale, ...]:
-        """Return the stale sources that ``mode`` needs, with their ages, ``in_mode_s`` after the last change of mode.
+        """Return the stale sources that ``mode`` needs, with their ages.
 
-        The v-bot has been shown for ``shown_s``.
+        ``in_mode_s`` is the time since the last change of mode, ``shown_s`` the time for which the v-bot is shown.
         """
         found = []
         for source in _required(mode):
             if source.optional and source.key not in inputs.ages:
                 continue
             age_s = _age_s(source, inputs, in_mode_s, shown_s)
-            # In this form NaN is stale.
+            # Written so that an age of NaN is stale.
             fresh = age_s <= self._allowed_s(source, inputs)
             if not fresh or (source.key == "command" and inputs.operator_gone):
                 found.append(Stale(source, age_s))
@@ -47,7 +48,7 @@ class SourceMonitor:
         return age_s > self.config.timeouts.lost_s(source.key, _usual_s(source, inputs))
 
     def command_is_fresh(self, inputs: ArbiterInputs) -> bool:
-        """Return whether the operator's command counts: young enough, and its client is still there."""
+        """Return whether the operator's command is young enough and its client still connected."""
         return inputs.age("command") <= self._command_s and not inputs.operator_gone
 
     def stale_in_s(self, inputs: ArbiterInputs, mode: Mode, in_mode_s: float, shown_s: float = math.inf) -> float:
@@ -56,11 +57,11 @@ class SourceMonitor:
             self._allowed_s(source, inputs) - _age_s(source, inputs, in_mode_s, shown_s) for source in _required(mode)
         ]
         left.append(self._command_s - inputs.age("command"))
-        # 0 is not stale yet, but right after this step.
+        # A source with 0 s left is not stale yet, but becomes so right after this step.
         return min((one for one in left if one >= 0.0), default=math.inf)
 
     def speed_limit_m_s(self, inputs: ArbiterInputs, mode: Mode) -> float:
-        """Return the speed at which the robot drives at most ``image_travel_m`` until a missing image stops it.
+        """Return the speed at which the robot drives at most ``image_travel_m`` before a missing image stops it.
 
         Rare images therefore slow the robot, instead of stopping it at each late one.
         """
@@ -70,7 +71,7 @@ class SourceMonitor:
         return min(most, self.config.timeouts.image_travel_m / longest_s) if longest_s > 0 else most
 
     def slowed(self, inputs: ArbiterInputs, mode: Mode, speed_m_s: float) -> str:
-        """Return the text for the operator while rare images keep ``speed_m_s`` from being driven; else empty."""
+        """Return the text for the operator if rare images do not allow ``speed_m_s``; else empty."""
         limit = self.speed_limit_m_s(inputs, mode)
         if speed_m_s <= limit:
             return ""
@@ -83,7 +84,7 @@ class SourceMonitor:
         return f" Slowed to {limit:.2f} m/s: {every}."
 
     def vbot_limit_m_s(self, inputs: ArbiterInputs, mode: Mode) -> float:
-        """Return the speed limit of the v-bot; below full speed it is slow enough for the r-bot to catch up."""
+        """Return the speed limit of the v-bot; below the r-bot's if rare images limit that, so that it catches up."""
         limit = self.speed_limit_m_s(inputs, mode)
         return limit if limit >= self.config.limits.max_linear_m_s else _CATCH_UP * limit
 
@@ -92,7 +93,7 @@ class SourceMonitor:
 
     @property
     def _command_s(self) -> float:
-        """Age in seconds up to which the operator's command counts."""
+        """Largest age in seconds at which the operator's command counts."""
         return self.config.timeouts.command - STEP_AFTER_S
 
 
@@ -110,6 +111,6 @@ def _usual_s(source: Source, inputs: ArbiterInputs) -> float | None:
 
 
 def _age_s(source: Source, inputs: ArbiterInputs, in_mode_s: float, shown_s: float) -> float:
-    # A source that nothing needed before the change may have been silent: its age counts from the change.
+    # A source that was not needed before the change may have been silent, so its age counts from the change.
     since_s = {"nav": in_mode_s, "view": shown_s, "vbot": shown_s}.get(source.key, math.inf)
     return min(inputs.age(source.key), since_s)

@@ -40,7 +40,7 @@ class VbotAction(IntEnum):
 
 
 class Reason(IntEnum):
-    """Values of ControlState.reason_code: why the robot drives, is slowed or stands. 0 is a message without a code."""
+    """Values of ControlState.reason_code: why the robot drives, is slowed or stands; 0: a message without a code."""
 
     UNKNOWN = 0
     # Driving
@@ -127,7 +127,7 @@ TRANSITIONS: tuple[Transition, ...] = (
     Transition(Mode.RETURNING, Mode.REAL, "image_fits", "hand_back"),
     Transition(Mode.STOPPED, Mode.REAL, "may_resume", "hand_back"),
 )
-"""In order: the first row of the present state whose guard holds is taken, at most one per step."""
+"""Transitions in order of priority: each step takes the first row of the present state whose guard holds."""
 
 GUARDS: dict[str, str] = {
     "estop_pressed": "the emergency stop is latched",
@@ -172,7 +172,7 @@ ACTIONS: dict[str, str] = {
 
 @dataclass(frozen=True)
 class Source:
-    """An input that must be fresh: beyond its time-out the command is zero; beyond ``stop_after_s``, STOPPED."""
+    """An input that must be fresh. After its time-out the command is zero, after ``stop_after_s`` the mode STOPPED."""
 
     key: str
     name: str
@@ -182,10 +182,10 @@ class Source:
     text: str = ""
     """Text for the operator while it is stale; empty: "No NAME for SECONDS."."""
     optional: bool = False
-    """Needed only after its first message: a robot without 3D points drives by its flat scan."""
+    """Needed only after its first message; a robot without 3D points drives by its flat scan."""
     steady: bool = False
-    """It has its own rate: the time-out is longer if its messages are usually rare. Images only: sources that keep the
-    robot off obstacles have fixed time-outs, so that it stops in time on a slow machine too."""
+    """The time-out is longer if messages are usually rare. Only images have this: sources that keep the robot off
+    obstacles have fixed time-outs, so that it stops in time even on a slow machine."""
 
 
 _MOVING = (Mode.REAL, Mode.ENTERING, Mode.VIRTUAL, Mode.RETURNING)
@@ -202,8 +202,8 @@ SOURCES: tuple[Source, ...] = (
     Source("view", "view of the virtual space", Reason.VIEW_STALE, _VIEW, steady=True),
     Source("vbot", "v-bot", Reason.VBOT_STALE, _VIEW),
     Source("nav", "path follower", Reason.NAV_STALE, (Mode.VIRTUAL,)),
-    # Where the operator drives the r-bot, silence is only a zero command; in VIRTUAL the r-bot would go on to the
-    # v-bot by itself.
+    # If the operator drives the r-bot, silence just means a zero command. In VIRTUAL, the r-bot would drive on towards
+    # the v-bot by itself.
     Source(
         "command",
         "operator's link",

@@ -1,4 +1,4 @@
-"""When a controller steps between two timers, and which timers it skips while the robot rests."""
+"""Timing of a controller: additional steps between two timers, and timers skipped while the robot rests."""
 
 from __future__ import annotations
 
@@ -9,29 +9,29 @@ REST_STEP_S = 0.1
 
 
 class StepTimes:
-    """Times of the last step and costmap, by a steady clock; ``rests``: the robot stands and nobody wants it to move.
+    """Times of the last step and costmap, by a steady clock. The robot rests while it stands with no command to move.
 
     Attributes:
         obeyed: the operator's command of the last step.
-        shown: whether the last step is published for display and planning; every second one is enough.
+        shown: whether the last step is published for display and planning; every second step is enough.
     """
 
     def __init__(self) -> None:
         self.obeyed = (0.0, 0.0)
         self.shown = True
-        self._early = False  # a step was made ahead of its time since the last timer
-        self._rests = False  # at the last step
+        self._early = False  # a step was made early since the last timer
+        self._rests = False  # the robot rested at the last step
         self._stepped_ns = self._costmap_ns = 0
 
     def timer_steps(self, now_ns: int, rests: bool = False) -> bool:
         """Return whether this timer steps."""
         self._early = False
         since_s = (now_ns - self._stepped_ns) / 1e9
-        # 0.9: timers jitter, and at 20 Hz every second one must step.
+        # 0.9, because timers jitter: at 20 Hz every second one must step.
         return not 0.0 <= since_s < 0.9 * REST_STEP_S or not rests
 
     def command_steps(self, command: tuple[float, float]) -> bool:
-        """Return whether to obey a command at once: a changed one does not wait half a period for the timer."""
+        """Return whether to step at once for a command, because a changed one must not wait for the timer."""
         if self._early or command == self.obeyed:
             return False
         self._early = True
@@ -45,7 +45,7 @@ class StepTimes:
         return True
 
     def begin_step(self, now_ns: int, rests: bool) -> bool:
-        """Note a step; return whether it ends a rest."""
+        """Record a step; return whether it ends a rest."""
         before, self._rests, self._stepped_ns = self._rests, rests, now_ns
         self.shown = not self.shown
         return before and not rests

@@ -13,11 +13,11 @@ from instant_ic.control.prediction import Prediction
 from instant_ic.control.walls import WallMap
 
 MAX_COST = 150
-"""Highest cost of a free place (0.42 m from obstacles)."""
+"""Highest cost of a free place; a place 0.42 m from obstacles has it."""
 WALL_CLEARANCE_M = 0.25
-"""A search straight on ends where the line comes nearer to a wall than this."""
+"""A search straight ahead ends where the line comes nearer to a wall than this."""
 _SEARCH_RADIUS_M = 1.5
-"""Radius of the search round the v-bot when nothing is free straight on."""
+"""Radius of the search round the v-bot if nothing is free straight ahead."""
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,7 @@ def extend_ahead(pose: NDArray[np.float64], length_m: float, step_m: float) -> N
 
 
 _UNSEEN_DEPTH_M = 0.6
-"""Unseen space behind an obstacle's near side counts as the obstacle to this depth."""
+"""Unseen space behind an obstacle's near side counts as part of the obstacle up to this depth."""
 
 
 def behind_obstacle(costmap: Costmap, ahead: NDArray[np.float64]) -> NDArray[np.bool_]:
@@ -61,8 +61,8 @@ def behind_obstacle(costmap: Costmap, ahead: NDArray[np.float64]) -> NDArray[np.
 def _free(costmap: Costmap, points: NDArray[np.float64]) -> NDArray[np.bool_]:
     """Mark the points (..., 2) that may be the subgoal."""
     costs = costmap.cost_at(points)
-    # The place behind an obstacle has not been seen yet, so unknown cells may be a goal. The planner does not drive
-    # into them; it goes on as the robot sees more.
+    # The place behind an obstacle has not been seen yet, so unknown cells may be a goal. The planner stops before them
+    # and goes on when the robot sees more.
     return (costs <= MAX_COST) | ((costs == UNKNOWN) & costmap.contains(points))
 
 
@@ -74,12 +74,12 @@ def choose_subgoal(
     walls: WallMap | None,
     extend_m: float,
 ) -> Subgoal | None:
-    """Return the subgoal for the v-bot's pose (3,) and its predicted trajectory, at most ``extend_m`` straight on.
+    """Return the subgoal for the v-bot's pose (3,) and its predicted trajectory.
 
-    The v-bot's pose if free; else the farthest free point of the trajectory; else the first free point straight on
-    from its end, before any wall; else the nearest free cell round the v-bot; else None. A free v-bot that is about to
-    pass an obstacle already sends the r-bot behind it. The r-bot then does not first follow up to the obstacle and
-    turn there.
+    It is the first of these that exists: the v-bot's pose if free; the farthest free point of the trajectory; the first
+    free point straight ahead of its end, within ``extend_m`` and before any wall; the free cell nearest to the v-bot.
+    If a free v-bot is about to pass an obstacle, the r-bot is already sent behind the obstacle, so that it does not
+    first follow up to it and turn there.
     """
     vbot_pose = np.asarray(vbot_pose, dtype=np.float64)
     if _free(costmap, vbot_pose[:2]):

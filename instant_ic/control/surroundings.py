@@ -22,13 +22,13 @@ from instant_ic.util.diagnosis import Diagnosis, Level
 log = logging.getLogger(__name__)
 
 _MOTION_SAMPLES = 9
-"""Poses of the sensor over a sweep of points; between them its motion counts as even."""
+"""Number of sensor poses over a sweep of points; motion between them is taken as uniform."""
 _CORRECTED_M, _CORRECTED_RAD = 0.05, math.radians(2.0)
-"""The map counts as corrected when the robot moves this much more in it than by odometry between two updates. The
-costmap's marks then move with the robot, since no sensor may see them again from near. Less is slip of the tracks."""
+"""The map counts as corrected if, between two updates, the robot moves this much more in the map than by odometry. The
+costmap's marks then move with the robot, since no sensor may see them again from near. A smaller difference is slip."""
 _JUMP_M, _JUMP_RAD = 0.5, 0.5
-"""Above this the robot counts as carried off: the costmap forgets its marks. The arbiter has stopped the robot by then
-(``pose_trust``)."""
+"""After a larger correction the robot counts as carried off, and the costmap forgets its marks. By then the arbiter has
+stopped the robot (``pose_trust``)."""
 
 
 @dataclass(frozen=True)
@@ -53,7 +53,7 @@ class ArrivedScan:
 
     @property
     def usable(self) -> bool:
-        """True if its geometry is known, and a beam has measured a range or that nothing is within range."""
+        """True if the scan's geometry is known, and any beam has a range or reports that nothing is within range."""
         known = math.isfinite(self.angle_min + self.angle_increment) and self.range_min < self.range_max
         return known and bool((np.asarray(self.ranges) >= self.range_min).any())
 
@@ -71,13 +71,13 @@ class ArrivedCloud:
 
 
 _BLIND_RAD, _LANE_M = math.radians(10.0), 1.0
-"""Width of a run of missing beams that counts as covered, and length of the lanes that must be seen."""
+"""Width of a run of missing beams that counts as covered, and length of the lanes ahead and behind that are checked."""
 
 
 class Surroundings:
-    """Places scans and 3D points by the transforms, and updates the costmap with them.
+    """The newest scan and 3D points, placed by the transforms, and the costmap that they update.
 
-    A scan whose transform has not arrived yet does not count: the previous one and its age stay.
+    A scan whose transform has not arrived yet is not used; the previous scan and its age are kept.
     """
 
     def __init__(self, config: CostmapConfig, footprint: Footprint, tf: TransformBuffer) -> None:
@@ -85,7 +85,7 @@ class Surroundings:
         self.costmap: Costmap | None = None
         self.points_seen = False
         self.blind = (False, False)
-        """LiDAR covered ahead, and behind: it measures nothing in a sector where it did before."""
+        """Flags (ahead, behind) of a covered LiDAR, which measures nothing in a sector where it did before."""
         self.findings: dict[str, Diagnosis] = {}
         """Diagnoses by input: scan, points, costmap, pose."""
         if not config.points.enabled:
@@ -94,7 +94,8 @@ class Surroundings:
             self._find("points", True, "No 3D points yet. Low and hanging things are not seen")
         self._tf = tf
         self._footprint = footprint
-        self._measured = self._unmeasured = np.zeros(0, np.bool_)  # beams so far, and in the newest scan
+        # Beams that have ever measured, and beams that did not measure in the newest scan.
+        self._measured = self._unmeasured = np.zeros(0, np.bool_)
         self._rolling = RollingCostmap(config, footprint)
         self._map_from_odom: Matrix | None = None
         self._scan_hits: NDArray[np.float64] | None = None  # (N, 2) of the newest scan with a transform, in odom
@@ -117,7 +118,7 @@ class Surroundings:
     def near_points(self, scan: ArrivedScan | None) -> NDArray[np.float64] | None:
         """Return the hits (N, 2) of the newest scan and points in ``base_link`` now, by odometry, which never jumps.
 
-        None while there is no scan, or its place is unknown.
+        None while there is no scan, or while its pose is unknown.
         """
         if scan is None:
             self._scan_hits = None
@@ -148,9 +149,9 @@ class Surroundings:
         return MovingPoints(found.points @ turn + base_from_odom[:2, 3], found.velocities @ turn)
 
     def used_age_s(self, key: str, now_ns: int, steady_ns: int) -> float:
-        """Return the age of the last ``scan`` or ``points`` with a transform, by arrival or stamp, the longer.
+        """Return the age in seconds of the last ``scan`` or ``points`` with a transform; inf without one.
 
-        Seconds; inf without one.
+        The age is the longer of those by arrival and by stamp.
         """
         if key not in self._used:
             return math.inf
@@ -158,7 +159,7 @@ class Surroundings:
         return max(now_ns - stamp_ns, steady_ns - arrived_ns) / 1e9
 
     def refuse_points(self, reason: str) -> None:
-        """Report 3D points that cannot be used; no later transform makes them usable."""
+        """Report 3D points that cannot be used, even with a later transform."""
         self.points_seen = True
         self._used.pop("points", None)
         self._find("points", False, f"3D points cannot be used: {reason}")
@@ -166,7 +167,7 @@ class Surroundings:
     def update_costmap(
         self, scan: ArrivedScan | None, cloud: ArrivedCloud | None, static: StaticMap | None
     ) -> Costmap | None:
-        """Add the newest scan and 3D points to the costmap; return it, None if nothing is new or known."""
+        """Add the newest scan and 3D points to the costmap and return it; None if nothing is new or known."""
         points_ns = -1 if cloud is None else self._take(cloud)
         pose = self.robot_pose()
         if pose is None or scan is None or not scan.usable:
@@ -176,7 +177,7 @@ class Surroundings:
         if (scan.stamp_ns, points_ns) == self._in_costmap:
             return None
         try:
-            # SLAM's correction changes slowly and arrives later than the scan: the newest one is good enough.
+            # SLAM's correction changes slowly and arrives later than the scan, so the newest one is good enough.
             map_from_odom = self._tf.lookup("map", "odom")
             map_from_lidar = map_from_odom @ self._tf.lookup("odom", scan.frame, scan.stamp_ns)
         except TransformError as error:
@@ -192,7 +193,7 @@ class Surroundings:
 
     def publish_due(self, steady_ns: int) -> bool:
         """Return whether the costmap is to be published now, by ``publish_frequency``; it then counts as published."""
-        # 0.9: updates come at the scan's rate, not at the publish frequency.
+        # 0.9, because updates come at the scan's rate, not at the publish frequency.
         due_ns = 0.9e9 / self.config.publish_frequency
         sent_ns = self._published_ns  # later than now if the clock went back: a bag player restarted
         if sent_ns is not None and 0 <= steady_ns - sent_ns < due_ns:
@@ -237,7 +238,7 @@ class Surroundings:
         self._used["scan"] = scan.stamp_ns, scan.arrived_ns
 
     def _blind(self, scan: ArrivedScan) -> tuple[bool, bool]:
-        """Return whether the last two scans lack beams, measured before, that cross the lanes ahead and behind."""
+        """Return whether the lanes ahead and behind lack beams in the last two scans that have measured before."""
         unmeasured = np.isnan(scan.ranges)
         if len(unmeasured) != len(self._measured):
             self._measured = self._unmeasured = np.zeros(len(unmeasured), np.bool_)

@@ -17,11 +17,11 @@ from instant_ic.geometry.poses import wrap_angle
 
 _TRACK_M = 0.1
 _WALL_CLEARANCE_M = 0.12
-"""Between the v-bot's outline and a wall, so that the r-bot has room at the same place."""
+"""Distance kept between the v-bot's outline and a wall, so that the r-bot has room at the same place."""
 _EASE_TIME_S = 0.25
-"""Time constant with which the last of an error vanishes."""
+"""Time constant of easing when the error is small."""
 _LEAD_BACK_M_S, _LEAD_BACK_RAD_S = 0.2, math.radians(20.0)
-"""Largest speed at which a v-bot that nobody drives goes back to the r-bot."""
+"""Largest speed at which a v-bot without a driver goes back to the r-bot."""
 
 
 @dataclass(frozen=True)
@@ -30,11 +30,11 @@ class VbotConfig:
 
     Attributes:
         max_lead_m: largest lead over the r-bot, in metres.
-        slow_lead_m: lead in metres from which on the v-bot is slowed.
-        trail_slow: share of its speed that it loses while the r-bot trails it: too little to be noticed, but the two
-            meet metres sooner.
+        slow_lead_m: lead in metres above which the v-bot is slowed.
+        trail_slow: share of its speed that the v-bot loses while the r-bot trails it: too little for the operator to
+            notice, but enough to make the two meet metres sooner.
         trail_m: lead in metres at which trail_slow is reached.
-        ease_m_s: largest speed in m/s at which it is eased onto the r-bot at the return, on top of the motion of both.
+        ease_m_s: largest speed in m/s, relative to the r-bot, at which the v-bot is eased onto it at the return.
         ease_deg_s: as ease_m_s, for the heading, in degrees/s.
     """
 
@@ -52,7 +52,7 @@ class VbotConfig:
 
 
 class VirtualRobot:
-    """The r-bot's kinematics and limits, without the r-bot's obstacles."""
+    """A robot with the r-bot's kinematics and limits, which obstacles do not stop."""
 
     def __init__(self, config: VbotConfig, limits: MotionLimits, footprint: Footprint | None = None) -> None:
         self.config = config
@@ -61,7 +61,7 @@ class VirtualRobot:
         self.pose: NDArray[np.float64] = np.zeros(3)
         self.velocity: tuple[float, float] = (0.0, 0.0)
         self.slowed_by = ""
-        """Why the last step was slower than commanded: ``lead``, ``wall`` or empty."""
+        """Reason why the last step was slower than commanded: ``lead``, ``wall`` or empty."""
         self._led_m_s = 0.0
         self._track: list[NDArray[np.float64]] = []  # driven places, ``_TRACK_M`` apart: the way back
 
@@ -82,17 +82,17 @@ class VirtualRobot:
     ) -> None:
         """Move by ``dt_s`` under the operator's command."""
         linear, angular = self.limits.clip(*command)
-        slower = min(1.0, max(0.0, speed_limit_m_s) / max(abs(linear), 1e-9))  # in this order NaN is 0
+        slower = min(1.0, max(0.0, speed_limit_m_s) / max(abs(linear), 1e-9))  # in this order, NaN counts as 0
         linear, angular = linear * slower, angular * slower
         factor = self.lead_factor(linear, robot_pose)
         self.slowed_by = "lead" if factor < 1.0 - self.config.trail_slow else ""
-        # Curvature is kept when slowed: the operator's line stays the same.
+        # A slowed command keeps its curvature, so that the v-bot stays on the operator's line.
         target = (linear * factor, angular * factor if linear != 0.0 else angular)
         if factor == 0.0:
             target = (0.0, angular)
         self.velocity = accelerate(self.velocity, target, self.limits, dt_s)
         pose = move(self.pose, self.velocity[0], self.velocity[1], dt_s)
-        # Turning on the spot is never blocked: a corner that grazes a wall does less harm than controls that stick.
+        # Turning on the spot is never blocked, because a corner in a wall does less harm than controls that stick.
         if walls is not None and self.velocity[0] != 0.0 and self._into_wall(pose, walls):
             self.slowed_by = "wall"
             self.velocity = (0.0, self.velocity[1])
@@ -103,7 +103,7 @@ class VirtualRobot:
             self._track.append(pose.copy())
 
     def ease(self, target: NDArray[np.float64], velocity: tuple[float, float], dt_s: float) -> None:
-        """Move for ``dt_s`` at the r-bot's ``velocity`` (m/s, rad/s), easing the remaining error to ``target`` (3,)."""
+        """Move for ``dt_s`` at the r-bot's ``velocity`` (m/s, rad/s), and reduce the error to ``target`` (3,)."""
         config = self.config
         self.velocity = self.limits.clip(*velocity)
         moved = move(self.pose, *self.velocity, dt_s)
@@ -124,9 +124,9 @@ class VirtualRobot:
         self.slowed_by = ""
 
     def lead_factor(self, linear: float, robot_pose: NDArray[np.float64]) -> float:
-        """Return the share of the linear speed that remains: a little less than 1 with a lead, 0 at ``max_lead_m``.
+        """Return the factor on the linear speed: a little below 1 with a small lead, 0 at ``max_lead_m``.
 
-        Only motion that draws the two apart is slowed; back towards the r-bot the v-bot drives freely.
+        Only motion away from the r-bot is slowed. Motion towards it is free.
         """
         gap = self.pose[:2] - np.asarray(robot_pose)[:2]
         lead = float(math.hypot(gap[0], gap[1]))

@@ -10,11 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 OCCUPIED = 65
-"""Cells from this probability on are obstacles."""
+"""Cells of at least this probability (0..100) are obstacles."""
 WALL_LENGTH_M = 1.5
-"""A straight run of occupied map cells this long is a wall, a shorter one is an obstacle."""
+"""A straight run of occupied map cells of at least this length is a wall; a shorter one is an obstacle."""
 WALL_PERIOD_S = 2.0
-"""Walls are searched for in a changed map at most this often."""
+"""Shortest time between two searches for walls in a changing map."""
 
 
 @dataclass(frozen=True)
@@ -35,8 +35,8 @@ class StaticMap:
 class WallMap:
     """Distance to the nearest wall of a map.
 
-    Only length tells walls from obstacles: a straight run of at least ``WALL_LENGTH_M`` is a wall, which the v-bot does
-    not pass. A box, a chair or a person is an obstacle, even where it touches a wall. Curved walls count as obstacles.
+    Walls and obstacles differ only in length: a straight run of at least ``WALL_LENGTH_M`` is a wall, which the v-bot
+    does not pass. A box, a chair or a person is an obstacle, even if it touches a wall. Curved walls are obstacles too.
     """
 
     def __init__(self, static: StaticMap) -> None:
@@ -44,7 +44,7 @@ class WallMap:
 
         self.static = static
         self.occupied: NDArray[np.bool_] = static.occupancy >= OCCUPIED
-        """(H, W) cells that may be part of a wall."""
+        """(H, W) mask of the cells that may be part of a wall."""
         occupied = self.occupied.astype(np.uint8)
         length = max(2, math.ceil(WALL_LENGTH_M / static.resolution))
         lines = cv2.HoughLinesP(occupied * 255, 1.0, math.pi / 180.0, length // 2, minLineLength=length, maxLineGap=3)
@@ -59,7 +59,7 @@ class WallMap:
             self._distance = np.full(self.mask.shape, np.inf)
 
     def distance(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the metres (...) from points (..., 2) to the nearest wall; inf outside the map."""
+        """Return the distance (...) in metres from points (..., 2) to the nearest wall; inf outside the map."""
         index = np.floor((np.asarray(points) - self.static.origin) / self.static.resolution).astype(np.int64)
         height, width = self._distance.shape
         columns, rows = index[..., 0], index[..., 1]
@@ -71,18 +71,18 @@ class WallMap:
 class WallSearch:
     """The newest map, and the walls found in it.
 
-    Finding walls in a large map takes tens of milliseconds, and a map comes each second; most bring nothing new.
+    Finding walls in a large map takes tens of milliseconds. A map arrives each second, and most bring nothing new.
     """
 
     def __init__(self) -> None:
         self.map: StaticMap | None = None
         self.found: WallMap | None = None
         self.submit: Callable[[StaticMap], None] = lambda static: None
-        """Starts :meth:`find` on another thread, whose result arrives at :meth:`on_found`."""
+        """Function that runs :meth:`find` on another thread and passes its result to :meth:`on_found`."""
         self._map_is_new = False
 
     def find(self, static: StaticMap) -> WallMap:
-        """Return the walls of ``static``; those found before if nothing has changed."""
+        """Return the walls of ``static``; the previous result if the map has not changed."""
         before = self.found
         if (
             before is None
@@ -94,7 +94,7 @@ class WallSearch:
         return before
 
     def on_map(self, grid: NDArray[np.int8], resolution: float, origin: tuple[float, float]) -> None:
-        """Take a map; the first one is searched at once, later ones by :meth:`update`."""
+        """Record a map. The first one is searched at once, later ones by :meth:`update`."""
         if grid.size == 0:
             return
         self.map, self._map_is_new = StaticMap(grid, resolution, np.array(origin)), True
@@ -108,5 +108,5 @@ class WallSearch:
             self.submit(self.map)
 
     def on_found(self, walls: WallMap) -> None:
-        """Take the result of a search."""
+        """Record the result of a search."""
         self.found = walls

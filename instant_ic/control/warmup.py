@@ -1,4 +1,4 @@
-"""Compiles the kernels before the robot moves: the first call of each takes up to seconds."""
+"""Compilation of the kernels before the robot moves, because the first call of each takes up to seconds."""
 
 from __future__ import annotations
 
