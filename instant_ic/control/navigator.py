@@ -84,7 +84,7 @@ class Navigator:
         now_ns: int,
         subgoal_velocity: tuple[float, float] = (0.0, 0.0),
     ) -> NavigatorStep:
-        """Return the twist from ``pose`` to ``subgoal`` (x, y, yaw), in the costmap's frame; zero if one is not finite."""
+        """Return the twist from ``pose`` to ``subgoal`` (x, y, yaw) in the same frame; zero if any is not finite."""
         if not np.isfinite([*pose, speed_m_s, *subgoal, *subgoal_velocity]).all():
             unknown = replace(self._plan, reached=False, reason="the pose, the subgoal or a speed is not a number")
             return NavigatorStep((0.0, 0.0), "end", unknown, False)
