@@ -1,1 +1,1 @@
-"""The hash-grid field: its kernels in numba, torch and Triton, and the torch reference that they are held to."""
+"""The hash-grid field: kernels in numba and Triton, and the plain torch reference for their tests."""

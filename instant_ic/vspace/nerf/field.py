@@ -17,28 +17,28 @@ Floats = NDArray[np.float32]
 TABLE_LR, NETWORK_LR = 0.04, 0.02
 """Learning rates at the start of a run."""
 FINAL_LR_SHARE = 0.03
-"""Both have fallen to this share at the end."""
+"""Learning rates at the end of a run, relative to its start."""
 REFRESH_LR_SHARE = 0.5
-"""Share of both when a keyframe refreshes a trained field."""
+"""Learning rates at the start of a refresh with a new keyframe, relative to those of the first run."""
 FINE_LR_SHARE = 0.1
-"""Learning rate of the finest level relative to the coarsest; less reduces grain and slows detail."""
+"""Learning rate of the finest level relative to the coarsest; a lower value reduces grain but slows detail."""
 DISTANCE_WEIGHT = 0.1
-"""Weight of the geometry's error against the colour's."""
+"""Weight of the distance error relative to the colour error."""
 BAND_COLOUR_WEIGHT = 0.3
-"""Weight of the colour error beside the surface against that on it."""
+"""Weight of a colour error beside the surface relative to one on the surface."""
 VOLUME_WEIGHTS = 0.1, 0.1, 0.01
-"""With a density: weights of a ray's depth error, of the opacity regulariser, and of the spread along the ray."""
+"""Weights of a ray's depth error, opacity regulariser and distortion, for density geometry."""
 BETA1, BETA2, EPSILON = 0.9, 0.99, 3e-7
 """Adam's constants, as in instant-ngp."""
 VOLUME_SAMPLES = 8
-"""Number of samples of a ray if geometry is a density, evenly through the truncation distance."""
+"""Number of samples of a ray for density geometry, evenly spaced within the truncation distance."""
 RAW_LIMITS = -10.0, 6.0
-"""Limits of the logarithm of the density; outside them it has no gradient."""
+"""Limits of the logarithm of the density. Outside them its gradient is zero."""
 
 
 @dataclass(frozen=True)
 class Lattice:
-    """Position and size of the hash grid's cells. It has no border: every place of the map has its cells.
+    """Position and size of the hash grid's cells. The grid is unbounded, so every point of the map lies in a cell.
 
     Attributes:
         origin: corner of a cell in the map, metres, (3,) float32.
@@ -50,24 +50,24 @@ class Lattice:
 
     @classmethod
     def for_prior(cls, prior: PanoramaPrior, config: FieldConfig) -> Lattice:
-        """Fit the cells: the coarsest is a sixteenth of the scene, the finest a panorama pixel at the median depth."""
+        """Fit the cells: the coarsest to a sixteenth of the scene, the finest to a panorama pixel at median depth."""
         extent = 2 * float(1.0 / np.quantile(prior.inverse_depth, 0.05))
         coarse = 16 / extent
         pixel = 2 * math.pi / prior.rgb.shape[1] * prior.median_depth_m
         fine = max(1 / pixel, 2 * coarse)
-        # Half a fine cell aside: a wall in the plane of a lattice face would use one side's entries only by chance.
+        # Offset by part of a fine cell: for a wall in the plane of a lattice face, rounding would select the side.
         origin = prior.map_from_camera[:3, 3] + 0.37 / fine
         return cls(origin.astype(np.float32), np.geomspace(coarse, fine, config.levels).astype(np.float32))
 
     def suits(self, other: Lattice) -> bool:
-        """Return whether a scene that asks for ``other`` can go on with this one: scales within a factor of 2."""
+        """Return whether a scene with the lattice ``other`` can keep this one: their scales differ by less than 2."""
         ratio = self.cells_per_m[[0, -1]] / other.cells_per_m[[0, -1]]
         return bool(np.all((ratio > 0.5) & (ratio < 2.0)))
 
 
 @dataclass
 class FieldParameters:
-    """Table (levels, size, features) and network (``w1``, ``b1``, ``w2``, ``b2``), float32."""
+    """Hash table (levels, size, features) and network (``w1``, ``b1``, ``w2``, ``b2``), all float32."""
 
     table: Floats
     w1: Floats
@@ -101,10 +101,10 @@ class TrainingScene:
     """Input of training and rendering: keyframes, lattice and occupancy.
 
     Attributes:
-        priors: the keyframes, newest first; all of one size.
+        priors: the keyframes, newest first; all have the same size.
         lattice: lattice of the field.
         occupancy: cells around the surfaces of all keyframes.
-        gains: factors that bring each keyframe's colours to the newest's exposure, (K, 3) float32; 1 where None.
+        gains: factors that bring each keyframe's colours to the newest's exposure, (K, 3) float32; None if all are 1.
     """
 
     priors: tuple[PanoramaPrior, ...]
@@ -113,14 +113,14 @@ class TrainingScene:
     gains: Floats | None = None
 
     def __post_init__(self) -> None:
-        """Check that there is a keyframe, and that the sizes of keyframes and gains fit (else ValueError)."""
+        """Raise ValueError if there is no keyframe, or if sizes of keyframes or gains do not match."""
         if not self.priors:
             raise ValueError("a scene needs a keyframe")
         sizes = {(prior.rgb.shape, prior.inverse_depth.shape) for prior in self.priors}
         if len(sizes) > 1:
-            raise ValueError(f"keyframes of one scene must have one size, panorama and depth (got {sorted(sizes)})")
+            raise ValueError(f"panoramas and depths of a scene's keyframes must have one size (got {sorted(sizes)})")
         if self.gains is not None and self.gains.shape != (len(self.priors), 3):
-            raise ValueError(f"gains must be ({len(self.priors)}, 3), a row a keyframe (got {self.gains.shape})")
+            raise ValueError(f"gains must be ({len(self.priors)}, 3), a row per keyframe (got {self.gains.shape})")
 
     @property
     def prior(self) -> PanoramaPrior:
@@ -129,26 +129,28 @@ class TrainingScene:
 
     @property
     def exposure(self) -> Floats:
-        """``gains``, (K, 3) float32."""
+        """``gains``, or ones if there are none, (K, 3) float32."""
         return np.ones((len(self.priors), 3), np.float32) if self.gains is None else self.gains.astype(np.float32)
 
     @property
     def focus(self) -> Floats:
-        """Places of the keyframes' cameras and radians of a panorama's pixel, (K, 4): how fine the field may be."""
+        """Position of each keyframe's camera in metres and angle of its panorama's pixels in radians, (K, 4).
+
+        They limit the resolution of the field.
+        """
         pixel = 2 * math.pi / self.prior.rgb.shape[1]
         return np.array([[*prior.map_from_camera[:3, 3], pixel] for prior in self.priors], np.float32)
 
 
 def ray_sources(keyframes: int, tiles: int, step: int) -> NDArray[np.int32]:
-    """Return the keyframe of each tile of a batch, (tiles,): half of them the newest, the rest the others.
+    """Assign a keyframe to each tile of a batch, (tiles,): the newest to half of the tiles, older ones to the rest.
 
-    Over the steps each keyframe looks everywhere: by a lattice of two irrational steps, so that no tile is left out
-    for long.
+    A low-discrepancy sequence over tiles and steps ensures that each keyframe soon trains every tile.
 
     Args:
         keyframes: number of keyframes of the scene.
         tiles: number of tiles of 8 × 8 rays in a batch.
-        step: step of this run, from 1.
+        step: number of the training step, from 1.
     """
     if keyframes == 1:
         return np.zeros(tiles, np.int32)
@@ -158,14 +160,15 @@ def ray_sources(keyframes: int, tiles: int, step: int) -> NDArray[np.int32]:
 
 
 LEAST_TRUST = 0.1
-"""Weight of depth that is guessed, against depth of the image's median uncertainty."""
+"""Smallest weight of uncertain depth; depth of median uncertainty has weight 1."""
 
 
 @dataclass(frozen=True)
 class StackedPriors:
-    """A scene's keyframes as the kernels take them, newest first: ``PanoramaPrior``'s arrays with a leading axis (K,).
+    """A scene's keyframes as input of the kernels: the arrays of ``PanoramaPrior``, stacked to (K, …), newest first.
 
-    ``trust``: weight of each pixel's depth in the loss by its uncertainty, (K, h, w), 1 at the image's median.
+    Attributes:
+        trust: weight of each pixel's depth in the loss by its uncertainty, (K, h, w); 1 for the image's median.
     """
 
     rgb: NDArray[np.uint8]
@@ -202,7 +205,7 @@ class StackedPriors:
 
 
 def depth_trust(prior: PanoramaPrior) -> Floats:
-    """Return the weight of each pixel's depth, (h, w) float32, by its squared uncertainty against the median."""
+    """Return the weight of each pixel's depth, (h, w) float32: the squared ratio of median to own uncertainty."""
     with np.errstate(divide="ignore", invalid="ignore"):
         ratio = np.where(prior.sigma > prior.relative_sigma, prior.relative_sigma / prior.sigma, 1.0)
     return np.clip(ratio * ratio, LEAST_TRUST, 1.0).astype(np.float32)
@@ -215,8 +218,8 @@ class Rays:
     Attributes:
         origin: position of the camera, (3,) float32.
         directions: unit vectors, (P, 3) float32.
-        axial: depth along the view's axis per metre along the ray, (P,); the inverse of an axial depth is linear over a
-            plane in the image.
+        axial: depth along the view's axis per metre along the ray, (P,). On the image of a plane, the inverse of the
+            axial depth is linear.
         shape: height and width of the view.
         stride: distance in pixels over which depth may be interpolated.
     """
@@ -237,7 +240,7 @@ class Device(Protocol):
 
     Attributes:
         name: name of the hardware and the backend, for the status.
-        on_gpu: it computes on a GPU.
+        on_gpu: True if the backend computes on a GPU.
     """
 
     name: str
@@ -247,28 +250,33 @@ class Device(Protocol):
         """Load parameters and reset the optimiser's moments."""
 
     def set_scene(self, scene: TrainingScene, parameters: FieldParameters | None = None) -> None:
-        """Train and render this scene from now on; resets the moments. A failure leaves the old scene.
+        """Replace the scene and reset the moments. After a failure the old scene remains.
 
         Args:
-            scene: the scene.
-            parameters: parameters to start from; None for the present ones.
+            scene: scene to train and render from now on.
+            parameters: parameters to start from; None keeps the present ones.
         """
 
     def step(self, uniform: Floats, table_lr: float, network_lr: float) -> tuple[float, float]:
-        """Train one iteration on the rays that ``uniform`` (N, 3) samples from the keyframes in turn (``ray_sources``).
+        """Train one iteration on rays of the keyframes that ``ray_sources`` selects.
+
+        Args:
+            uniform: random numbers in [0, 1) that place the rays, (N, 3).
+            table_lr: learning rate of the table.
+            network_lr: learning rate of the network.
 
         Returns:
-            Mean squared colour error (0..1 units) and mean squared distance error (units of the band).
+            Mean squared colour error (colours 0 to 1) and mean squared distance error (in truncation distances).
         """
 
     def render_rays(self, rays: Rays, panorama_share: float, depth_share: float) -> tuple[Floats, Floats, Floats]:
-        """Render rays; return colours (P, 3), 0 to 1, depth (P,), 0 where nothing is met, and confidence (P,).
+        """Render rays; return colours (P, 3), 0 to 1, depth (P,), 0 where a ray hits nothing, and confidence (P,).
 
         Args:
             rays: P rays of the view.
-            panorama_share: weight of the keyframe's panorama in the colour of surfaces that it has seen; the rest is
-                the field's. With 1 the colour of surfaces without confidence is not worked out.
-            depth_share: weight of the keyframe's depth in the signed distance; the rest is the field's.
+            panorama_share: weight of a keyframe's panorama in the colour of surfaces that the keyframe has seen; the
+                field has the remaining weight. With 1, surfaces without confidence get no colour.
+            depth_share: weight of the keyframes' depth in the signed distance; the field has the remaining weight.
         """
 
     def parameters(self) -> FieldParameters:
@@ -277,7 +285,7 @@ class Device(Protocol):
 
 @dataclass
 class Schedule:
-    """Learning rates that fall exponentially over a run."""
+    """A schedule of learning rates that fall exponentially over a run."""
 
     config: TrainConfig
     refresh: bool = False
@@ -298,8 +306,8 @@ class Schedule:
 def sample_weights(config: TrainConfig) -> tuple[Floats, Floats]:
     """Return the weights of a batch's samples in the losses of colour and distance, (2 · rays,) each.
 
-    Samples in the band carry their ray's colour too, at less weight: a view from aside may meet the surface a little
-    off its place.
+    Samples beside the surface also train their ray's colour, with less weight, because a view from another direction
+    may hit the surface slightly in front of or behind it.
     """
     rays = config.ray_columns * config.ray_rows
     on_surface = np.repeat(np.tile([True, False], rays // 64), 64)
@@ -309,7 +317,7 @@ def sample_weights(config: TrainConfig) -> tuple[Floats, Floats]:
 
 
 def volume_rays(config: TrainConfig) -> tuple[int, int]:
-    """Return a batch's columns and rows for a density: it makes as many field queries as a distance."""
+    """Return columns and rows of a batch for density geometry, with as many field queries as for distance geometry."""
     return config.ray_columns // 2, config.ray_rows // 2
 
 
@@ -319,5 +327,5 @@ def level_rates(levels: int) -> Floats:
 
 
 def adam_step_size(lr: float, step: int) -> float:
-    """Return Adam's step size with both bias corrections; ``step`` counts from 1."""
+    """Return Adam's step size with both bias corrections for ``step``, counted from 1."""
     return lr * math.sqrt(1 - BETA2**step) / (1 - BETA1**step)

@@ -1,12 +1,12 @@
-"""CPU kernels of the field: hash encoding, network, gradients by hand, Adam on touched entries (numba).
+"""CPU kernels of the field in numba: hash encoding, network, their analytic gradients, and Adam on touched entries.
 
-Each function has a plain torch reference of the same name in ``reference.py``. All run on one thread, release the
-interpreter lock and give the same bits for the same input.
+Tests compare the kernels with plain torch in ``reference.py``. All run on one thread, release the interpreter lock and
+give the same bits for the same input.
 
 Layout: ``table`` (levels, size, features), ``w1`` (hidden, levels·features), ``b1`` (hidden,), ``w2`` (4, hidden),
 ``b2`` (4,). Outputs 0..2 are the colour minus 0.5, output 3 the signed distance. Points are handled in blocks of
-``BLOCK`` with the point as the last axis, so that the compiler vectorises over points. Every module of kernels takes
-its options from here, so that stale machine code is gone before any is loaded.
+``BLOCK`` with the point as the last axis, so that the compiler vectorises over points. Every module of kernels imports
+its options from here, so that stale machine code is deleted before any of it is loaded.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from instant_ic.vspace.nerf.vectors import adam, gather, scatter
 
 BLOCK = 64
 MARKED = 4
-"""Number of table entries that share a mark: 64 bytes, a cache line."""
+"""Number of table entries that share a mark, because together they fill a cache line of 64 bytes."""
 _P1 = 2654435761
 _P2 = 805459861
 _OPTIONS: dict[str, Any] = {"cache": True, "nogil": True, "fastmath": True, "error_model": "numpy"}
@@ -37,9 +37,11 @@ def no_marks(table: np.ndarray) -> np.ndarray:
 
 @njit(**_OPTIONS)
 def pixel_block(points, start, count, focus, pixel):  # type: ignore[no-untyped-def]
-    """Write the width in metres of a pixel of the keyframe that shows ``points[start:start + count]`` finest.
+    """Write the pixel width at each point of ``points[start:start + count]``, of the keyframe that shows it finest.
 
-    ``focus``: places of the keyframes' cameras and radians of a pixel, (K, 4).
+    Args:
+        focus: position of each keyframe's camera in metres, and angle of its pixels in radians, (K, 4).
+        pixel: width of the pixel at the point in metres, (BLOCK,); written.
     """
     for i in range(count):
         x, y, z = points[start + i, 0], points[start + i, 1], points[start + i, 2]
@@ -52,13 +54,15 @@ def pixel_block(points, start, count, focus, pixel):  # type: ignore[no-untyped-
 
 @njit(**_OPTIONS)
 def cells_block(points, start, count, origin, scale, size, pixel, entries, weights):  # type: ignore[no-untyped-def]
-    """Find the table entries of a block's points in one level, at their cells' corners, and the trilinear weights.
+    """Find table entries and trilinear weights at the corners of the cells that contain a block's points, in one level.
 
-    A level counts whole while its cells are wider than the keyframe's pixel there, not at all from half of it.
+    A level has full weight if its cells are wider than a keyframe's pixel at the point, and none below half a pixel.
 
     Args:
-        size: entries of a level, a power of two; pixel: (BLOCK,), of ``pixel_block``.
-        entries: out, (8, BLOCK) uint32; weights: out, (8, BLOCK) float32.
+        size: number of entries of a level, a power of two.
+        pixel: result of ``pixel_block``, (BLOCK,).
+        entries: table entries, (8, BLOCK) uint32; written.
+        weights: trilinear weights, (8, BLOCK) float32; written.
     """
     one = np.float32(1)
     p1, p2, mask = np.uint32(_P1), np.uint32(_P2), np.uint32(size - 1)
@@ -99,8 +103,9 @@ def encode_block(  # type: ignore[no-untyped-def]
 ):
     """Write the trilinear features of ``points[start:start + count]`` to ``x`` (levels·features, BLOCK).
 
-    ``entries``, ``weights``: out, (levels, 8, BLOCK) for ``encode_backward_block``, of ``cells_block``; with (1, 8,
-    BLOCK), where no gradient is wanted, one level is written over the other.
+    Args:
+        entries, weights: results of ``cells_block`` for ``encode_backward_block``, (levels, 8, BLOCK); written. Without
+            a gradient (1, 8, BLOCK) is enough: each level then overwrites the one before.
     """
     levels, size, features = table.shape
     pixel = np.empty(BLOCK, np.float32)
@@ -156,7 +161,7 @@ def relu_block(y):  # type: ignore[no-untyped-def]
 
 @njit(**_OPTIONS)
 def layer_backward_block(w, x, dy, gw, gb, dx):  # type: ignore[no-untyped-def]
-    """Add the gradients of ``layer_block`` to ``gw`` and ``gb``; write ``dx`` (k, BLOCK). k and m: multiples of 4."""
+    """Add the gradients of ``layer_block`` to ``gw`` and ``gb``; write ``dx`` (k, BLOCK). 4 must divide k and m."""
     for k in range(w.shape[1]):
         out = dx[k]
         for i in range(BLOCK):
@@ -188,7 +193,7 @@ def layer_backward_block(w, x, dy, gw, gb, dx):  # type: ignore[no-untyped-def]
 
 @njit(**_OPTIONS)
 def network_backward_block(w1, w2, x, h, dy, g1, gb1, g2, gb2, dh, dx):  # type: ignore[no-untyped-def]
-    """Add the network's gradients to ``g1`` to ``gb2``; write ``dh`` and ``dx``. ``h`` is taken after its ReLU."""
+    """Add the network's gradients to ``g1`` … ``gb2``; write ``dh`` and ``dx``. ``h`` is the output of the ReLU."""
     layer_backward_block(w2, h, dy, g2, gb2, dh)
     for j in range(h.shape[0]):
         for i in range(BLOCK):
@@ -225,7 +230,9 @@ def gradient(  # type: ignore[no-untyped-def]
     Loss: ``Σ colour_weight[i] · |colour_i − target_i[:3]|² + distance_weight[i] · (distance_i − target_i[3])²``.
 
     Args:
-        points: (N, 3); target: (N, 4), colour minus 0.5 and signed distance; both weights: (N,).
+        points: points in the map in metres, (N, 3).
+        target: colour minus 0.5 and signed distance, (N, 4).
+        colour_weight, distance_weight: weights of the points in the loss, (N,) each.
 
     Returns:
         Weighted squared colour error and weighted squared distance error, sums over the points.
@@ -267,7 +274,7 @@ def adam_touched(  # type: ignore[no-untyped-def]
 ):
     """Update the entries that have a gradient by one Adam step; clear gradients and marks.
 
-    Entries without a mark of ``encode_backward_block`` in ``touched`` are skipped; they keep value and moments, as in
+    Entries that ``encode_backward_block`` has not marked in ``touched`` keep value and moments, as in
     ``torch.optim.SparseAdam``. ``step_size`` (levels,) includes the bias correction, ``lr · √(1 − β2ᵗ) / (1 − β1ᵗ)``.
     """
     levels, size, _ = table.shape

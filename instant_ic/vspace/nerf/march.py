@@ -1,6 +1,6 @@
-"""CPU kernels of rays: training samples from the panorama, and the march to the surface (numba).
+"""CPU kernels for rays in numba: training samples from the panorama, and the march to the surface.
 
-The torch functions of the same names in ``reference.py`` do the same.
+Functions of the same names in ``reference.py`` compute the same in torch.
 """
 
 from __future__ import annotations
@@ -15,9 +15,9 @@ from instant_ic.vspace.nerf.kernels import _OPTIONS, BLOCK, encode_block, layer_
 FIRST_STEP = 0.7
 """Smallest step through empty cells, in cells."""
 NOT_SEEN = np.float32(1e9)
-"""Value of an unknown earlier distance."""
+"""Value that stands for an unknown signed distance at the previous sample."""
 LOOKED_THROUGH = 3.0
-"""A keyframe whose surface lies this many truncation distances behind a point has looked through it: it is free."""
+"""Truncation distances from a point to a keyframe's surface behind it above which the point is free space."""
 
 
 @njit(**_OPTIONS)
@@ -38,12 +38,13 @@ def prior_inverse_depth(inverse, depth_edge, u, v):  # type: ignore[no-untyped-d
 
 @njit(**_OPTIONS)
 def _bilinear_colour(rgb, gain, turn, fall, target, surface, near):  # type: ignore[no-untyped-def]
-    """Write a panorama's colour, in the newest's exposure and minus 0.5, to two samples.
+    """Write a panorama's colour, in the newest keyframe's exposure and minus 0.5, to two samples.
 
     Args:
-        rgb: panorama, (H, W, 3); gain: (3,).
-        turn, fall: place in it as shares of its width and height.
-        target: (2 N, 4), rows ``surface`` and ``near`` are written.
+        rgb: panorama, (H, W, 3).
+        gain: colour factors to the newest keyframe's exposure, (3,).
+        turn, fall: position in the panorama as shares of its width and height.
+        target: training targets, (2 N, 4); rows ``surface`` and ``near`` are written.
     """
     height, width = rgb.shape[:2]
     one, half = np.float32(1), np.float32(0.5)
@@ -66,18 +67,20 @@ def sample_rays(  # type: ignore[no-untyped-def]
     uniform, columns, rows, sources, rgb, inverse, depth_edge, usable, trust, map_from_camera, gains, band,
     points, target, weight
 ):  # fmt: skip
-    """Sample one ray in each of ``columns × rows`` strata of equal solid angle, with two samples a ray.
+    """Sample one ray in each of ``columns × rows`` strata of equal solid angle, with two points per ray.
 
     Args:
-        uniform: (N, 3) in [0, 1): place in the stratum (azimuth, height) and in the band; N = columns · rows.
-        sources: (N / 64,): the keyframe that each tile of 8 × 8 strata looks from.
+        uniform: random numbers in [0, 1), (N, 3), N = columns · rows: position in the stratum (azimuth, height), and
+            of the second point within the truncation distance.
+        sources: keyframe of each tile of 8 × 8 strata, (N / 64,).
         rgb, inverse, depth_edge, usable, band: arrays of the ``PanoramaPrior``s, newest first, stacked: (K, …).
-        trust: (K, h, w): weight of the depth by its uncertainty, 0..1.
-        map_from_camera: (K, 4, 4) float32; gains: (K, 3).
-        points: out, (2 N, 3). Rays go by tiles: 64 points on the surface, then 64 in the band.
-        target: out, (2 N, 4): colour minus 0.5, the ray's for both; signed distance in units of the newest's band (in
-            front positive).
-        weight: resulting weights of colour and distance, (2 N, 2); 0 where no ray may be sampled.
+        trust: weight of the depth by its uncertainty, 0 to 1, (K, h, w).
+        map_from_camera: poses of the cameras, (K, 4, 4) float32.
+        gains: colour factors to the newest keyframe's exposure, (K, 3).
+        points: sampled points, (2 N, 3); written. Each tile has 64 points on the surface, then 64 beside it.
+        target: colour of the ray minus 0.5, and signed distance in the newest keyframe's truncation distances, positive
+            in front of the surface, (2 N, 4); written.
+        weight: weights of colour and distance, (2 N, 2); written; 0 where no ray may be sampled.
     """
     h, w = inverse.shape[1:]
     tiles = columns // 8
@@ -118,7 +121,7 @@ def sample_rays(  # type: ignore[no-untyped-def]
 
 @njit(**_OPTIONS)
 def prior_agrees(x, y, z, inverse, depth_edge, known, tolerance):  # type: ignore[no-untyped-def]
-    """Return 2 for a point of the camera frame on a surface of known depth, 1 on filled depth, else 0.
+    """Return 2 for a point in the camera's frame on a surface of known depth, 1 for one on filled depth, 0 otherwise.
 
     ``tolerance`` is relative to the distance.
     """
@@ -146,7 +149,7 @@ def prior_agrees(x, y, z, inverse, depth_edge, known, tolerance):  # type: ignor
 
 @njit(**_OPTIONS)
 def prior_distance(x, y, z, inverse, depth_edge, band):  # type: ignore[no-untyped-def]
-    """Return the signed distance of a point of the camera's frame to the surface in its direction, in bands."""
+    """Return the distance from a point in the camera's frame to the surface behind it, in truncation distances."""
     height, width = inverse.shape
     flat = math.sqrt(x * x + y * y)
     u = np.float32((math.pi - math.atan2(y, x)) * (width / (2 * math.pi)) - 0.5)
@@ -157,12 +160,13 @@ def prior_distance(x, y, z, inverse, depth_edge, band):  # type: ignore[no-untyp
 
 @njit(**_OPTIONS)
 def nearest_prior(x, y, z, inverse, depth_edge, known, camera_from_map, band, all_agree):  # type: ignore[no-untyped-def]
-    """Find the keyframes' surface nearest to a point of the map, except those that a newer keyframe has looked through.
+    """Find the keyframes' surface nearest to a point of the map. Surfaces that a newer keyframe refutes do not count.
 
-    Arguments as in ``trace``; ``all_agree``: compute the agreement (0 otherwise).
+    A newer keyframe refutes them if it has looked through the point. The arguments are those of ``trace``; without
+    ``all_agree`` the agreement is not computed and is 0.
 
     Returns:
-        Signed distance in bands of the newest keyframe, and the best agreement of all (``prior_agrees``).
+        Signed distance in truncation distances of the newest keyframe, and the best agreement (``prior_agrees``).
     """
     best, best_agrees, unit = np.float32(NOT_SEEN), 0, np.float32(1)
     seen_through = False
@@ -183,7 +187,7 @@ def nearest_prior(x, y, z, inverse, depth_edge, known, camera_from_map, band, al
 
 @njit(**_OPTIONS)
 def prior_known(x, y, z, known):  # type: ignore[no-untyped-def]
-    """Return whether the depth is known in the direction of a point of the camera frame."""
+    """Return whether the depth is known in the direction of a point in the camera's frame."""
     height, width = known.shape
     u = (math.pi - math.atan2(y, x)) * (width / (2 * math.pi))
     v = (math.pi / 2 - math.atan2(z, math.sqrt(x * x + y * y))) * (height / math.pi)
@@ -192,7 +196,7 @@ def prior_known(x, y, z, known):  # type: ignore[no-untyped-def]
 
 @njit(**_OPTIONS)
 def grid_span(origin, direction, low, cell, shape):  # type: ignore[no-untyped-def]
-    """Return the lengths at which a ray enters and leaves the grid; entry > exit if it misses it."""
+    """Return the lengths at which a ray enters and leaves the grid; for a ray that misses it, entry > exit."""
     enter, leave = 0.0, 1e9
     for axis in range(3):
         a, b = low[axis], low[axis] + cell * shape[axis]
@@ -208,7 +212,7 @@ def grid_span(origin, direction, low, cell, shape):  # type: ignore[no-untyped-d
 
 @njit(**_OPTIONS)
 def next_occupied(origin, direction, t, leave, grid, low, cell):  # type: ignore[no-untyped-def]
-    """Return the first depth from ``t`` on that lies in an occupied cell; −1 beyond ``leave``."""
+    """Return the first length along a ray, from ``t`` on, that lies in an occupied cell; −1 if it is past ``leave``."""
     nx, ny, nz = grid.shape
     per_cell = 1 / cell
     x, y, z = ((origin[0] - low[0]) * per_cell, (origin[1] - low[1]) * per_cell, (origin[2] - low[2]) * per_cell)
@@ -219,20 +223,20 @@ def next_occupied(origin, direction, t, leave, grid, low, cell):  # type: ignore
         distance = grid[ix, iy, iz]
         if distance == 0:
             return t
-        # City-block distance d: the nearest occupied cell is no nearer than (d − 1) / √3 edges, within the margin.
+        # At city-block distance d the nearest occupied cell is at least (d − 1) / √3 edges away, within the margin.
         t += cell * max(FIRST_STEP, 0.577 * (distance - 1))
     return -1.0
 
 
 @njit(**_OPTIONS)
 def at_length(origin, direction, t):  # type: ignore[no-untyped-def]
-    """Return the place ``t`` along a ray."""
+    """Return the point at length ``t`` of a ray."""
     return origin[0] + t * direction[0], origin[1] + t * direction[1], origin[2] + t * direction[2]
 
 
 @njit(**_OPTIONS)
 def along(target_from_source, origin, direction, t):  # type: ignore[no-untyped-def]
-    """Return the place ``t`` along a ray, in another frame."""
+    """Return the point at length ``t`` of a ray, in another frame."""
     x, y, z = at_length(origin, direction, t)
     return transformed(target_from_source, x, y, z)
 
@@ -266,7 +270,7 @@ def _enter_grid(origin, directions, pixels, grid, low, cell, state, active):  # 
 def _skip_empty_cells(  # type: ignore[no-untyped-def]
     origin, directions, pixels, grid, low, cell, state, active, size, depth, confidence
 ):
-    """Move each active ray to its next occupied cell; return how many have one. The others end."""
+    """Move each active ray to its next occupied cell and return the number of rays that have one. Other rays end."""
     t, leave, _, _, spare, _ = state
     queries = 0
     for k in range(size):
@@ -284,13 +288,14 @@ def _skip_empty_cells(  # type: ignore[no-untyped-def]
 
 @njit(**_OPTIONS)
 def _ends_here(n, value, cell, keyframes, share, origin, direction, state, pixel, depth, confidence):  # type: ignore[no-untyped-def]
-    """Test a ray at its present sample, and move it on; return True if it ends on a surface.
+    """Test a ray at its present sample; return True if it ends on a surface, otherwise advance it.
 
     Args:
-        n: index of the ray; value: the field's signed distance there, in bands.
+        n: index of the ray.
+        value: signed distance of the field at the sample, in truncation distances.
         keyframes: arrays ``inverse``, ``depth_edge``, ``known``, ``camera_from_map`` and ``band`` of ``trace``.
-        state: arrays of ``trace``, by ray.
-        pixel: place of the ray in ``depth`` and ``confidence``, which are written if it ends.
+        state: the rays' state, see ``trace``.
+        pixel: index of the ray in ``depth`` and ``confidence``, which are written if the ray ends.
     """
     t, _, last_t, last_s, spare, spare_s = state
     inverse, depth_edge, known, camera_from_map, band = keyframes
@@ -328,21 +333,21 @@ def trace(  # type: ignore[no-untyped-def]
 ):  # fmt: skip
     """March rays to the first zero of the signed distance that agrees with a keyframe's depth.
 
-    The distance is the field's and the prior's own, mixed: a young field's surfaces are rough.
+    The signed distance is a mix of the field's and the keyframes', because the surfaces of a young field are rough.
 
     Args:
         grid, low, cell: grid, lowest corner and cell size of the ``Occupancy``.
         inverse, depth_edge, known, band: arrays of the ``PanoramaPrior``s, newest first, stacked: (K, …).
         camera_from_map: (K, 4, 4) float32.
-        share: weight of the prior in the distance, 0..1; with 1 the field is not asked at all.
-        origin: (3,); directions: (P, 3) unit vectors of all pixels, map frame.
-        pixels: (N,) which of them to march.
-        depth: out, (P,): metres along the ray, 0 where it meets nothing.
-        confidence: out, (P,): 1 on a surface that a keyframe has seen from its front, 0.5 where its depth was filled.
+        share: weight of the keyframes' depth in the distance, 0 to 1; with 1 the field is not queried.
+        origin, directions: position of the view, (3,), and unit vectors of its pixels, (P, 3), in the map's frame.
+        pixels: indices of the pixels to march, (N,).
+        depth: metres along the ray, 0 where it hits nothing, (P,); written.
+        confidence: 1 on the front of a surface that a keyframe has seen, 0.5 where its depth was filled, (P,); written.
     """
     count = pixels.shape[0]
-    # By ray: t and where it leaves the grid, last t and distance, and the place nearest to the surface so far with its
-    # distance, should the field show no crossing.
+    # Per ray: t and its end, t and distance of the last sample, and t and distance of the sample nearest to a surface,
+    # at which the ray ends if the distance never changes its sign.
     state = (
         np.zeros(count, np.float32), np.zeros(count, np.float32), np.zeros(count, np.float32),
         np.full(count, NOT_SEEN, np.float32), np.zeros(count, np.float32), np.full(count, NOT_SEEN, np.float32),
@@ -386,7 +391,7 @@ def trace(  # type: ignore[no-untyped-def]
 
 @njit(**_OPTIONS)
 def panorama_pixels(x, y, z, height, width):  # type: ignore[no-untyped-def]
-    """Return the pixels around a direction: two rows, the lower's weight, two columns, the right one's weight."""
+    """Return the pixels around a direction: two rows and the lower one's weight, two columns and the right's weight."""
     u = np.float32((math.pi - math.atan2(y, x)) * (width / (2 * math.pi)) - 0.5)
     v = np.float32((math.pi / 2 - math.atan2(z, math.sqrt(x * x + y * y))) * (height / math.pi) - 0.5)
     v = min(max(v, np.float32(0)), np.float32(height - 1))
@@ -402,10 +407,11 @@ def mix_panorama(  # type: ignore[no-untyped-def]
 
     Args:
         rgb, inverse, depth_edge, known, band: arrays of the ``PanoramaPrior``s, newest first, stacked: (K, …).
-        camera_from_map: (K, 4, 4); gains: (K, 3).
-        depth, confidence: (P,), of ``trace``; nothing happens where either is 0.
-        share: weight of the panorama, 0..1.
-        colour: in and out, (P, 3) in 0..1.
+        camera_from_map: poses of the map in the cameras' frames, (K, 4, 4).
+        gains: colour factors to the newest keyframe's exposure, (K, 3).
+        depth, confidence: results of ``trace``, (P,); where either is 0, the colour does not change.
+        share: weight of the panorama, 0 to 1.
+        colour: RGB of the view, 0 to 1, (P, 3); updated in place.
     """
     count, height, width = rgb.shape[:3]
     one = np.float32(1)
@@ -429,7 +435,7 @@ def interpolate_depth(depth, confidence, stride, tolerance, pixels):  # type: ig
     """Fill the pixels at multiples of ``stride`` from their traced neighbours at multiples of ``2·stride``.
 
     ``depth`` (H, W) is measured along the view's axis, so that its inverse is linear over a plane. Pixels whose
-    neighbours differ by more than ``tolerance``, or meet nothing, are listed in ``pixels`` and have to be traced.
+    neighbours differ by more than ``tolerance``, or hit nothing, are listed in ``pixels`` and must be traced.
 
     Returns:
         Number of listed pixels.

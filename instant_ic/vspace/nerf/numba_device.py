@@ -1,4 +1,4 @@
-"""Training and rendering on one CPU thread by the numba kernels."""
+"""Training and rendering on one CPU thread with the numba kernels."""
 
 from __future__ import annotations
 
@@ -27,14 +27,16 @@ from instant_ic.vspace.nerf.field import (
 )
 
 FIRST_STRIDE = 4
-"""Distance in pixels of the rays traced first, at most ``Rays.stride``; the rest are traced only where those between
-differ; a power of two, 1 traces all."""
+"""Distance in pixels between the rays that are always traced, a power of two; ``Rays.stride`` may lower it.
+
+Pixels between them are interpolated where their neighbours' depths agree; 1 traces all pixels.
+"""
 DEPTH_TOLERANCE = 0.08
-"""Neighbours further apart than this share are traced, not interpolated."""
+"""Largest relative difference of neighbouring depths between which a pixel is interpolated."""
 
 
 class NumbaDevice:
-    """See ``field.Device``. Not thread-safe: one thread at a time."""
+    """Backend on the CPU (see ``field.Device``); not thread-safe."""
 
     name = "cpu (numba)"
     on_gpu = False
@@ -66,16 +68,16 @@ class NumbaDevice:
         self._scene, self._focus, self._priors = scene, scene.focus, StackedPriors.of(scene)
 
     def step(self, uniform: Floats, table_lr: float, network_lr: float) -> tuple[float, float]:
-        """Train one step: sample rays, add gradients, update by Adam; as ``reference.train_step``."""
+        """Train one step like ``reference.train_step``: sample rays, add gradients, update by Adam."""
         self._steps += 1
         weight, sources = self._sample_rays(uniform)
         colour, distance = self._gradient(uniform, weight, sources)
         self._adam(table_lr, network_lr)
-        share = np.maximum(weight.mean(axis=0), np.float32(1e-3)).tolist()  # of the samples that count
+        share = np.maximum(weight.mean(axis=0), np.float32(1e-3)).tolist()  # mean weight, for errors per counted sample
         return colour / share[0], distance / share[1]
 
     def _sample_rays(self, uniform: Floats) -> tuple[Floats, NDArray[np.int32]]:
-        """Fill the batch's points and targets; returns weights (2 N, 2) and the keyframe of each tile."""
+        """Fill the batch's points and targets; return weights (2 N, 2) and the keyframe of each tile."""
         priors = self._priors
         columns, rows = volume_rays(self._train) if self._density else (self._train.ray_columns, self._train.ray_rows)
         weight = self._weight[: 2 * columns * rows]
@@ -88,7 +90,7 @@ class NumbaDevice:
         return weight, sources
 
     def _gradient(self, uniform: Floats, weight: Floats, sources: NDArray[np.int32]) -> tuple[float, float]:
-        """Add the gradient of the batch to the gradients; returns colour and distance error."""
+        """Add the batch's gradient to the stored gradients; return colour and distance error."""
         p, place = self._p, self._place
         grads = self._table_grad, self._touched, *self._network_grads
         if self._density:
@@ -118,7 +120,7 @@ class NumbaDevice:
             grad[...] = 0
 
     def render_rays(self, rays: Rays, panorama_share: float, depth_share: float) -> tuple[Floats, Floats, Floats]:
-        # A density is composited round the keyframes' own depth.
+        # Density geometry is composited around the keyframes' depth, so that the march needs no field.
         axial_depth, confidence = self._trace(rays, 1.0 if self._density else depth_share)
         depth = axial_depth / rays.axial
         guide, colour = depth, np.zeros((len(depth), 3), np.float32)
@@ -144,11 +146,14 @@ class NumbaDevice:
 
     @property
     def _place(self) -> tuple[Floats, Floats, Floats]:
-        """Cells and origin of the lattice, and the scene's ``focus``, as the kernels take them."""
+        """Cells and origin of the lattice, and ``focus`` of the scene, as arguments of the kernels."""
         return self._scene.lattice.cells_per_m, self._scene.lattice.origin, self._focus
 
     def _trace(self, rays: Rays, depth_share: float) -> tuple[Floats, Floats]:
-        """Return depth along the view's axis and confidence; trace every 4th pixel, then where interpolation fails."""
+        """Return depth along the view's axis and confidence.
+
+        Every ``first_stride``-th pixel is traced first, then those that cannot be interpolated.
+        """
         height, width = rays.shape
         depth = np.zeros(height * width, np.float32)
         confidence = np.zeros(height * width, np.float32)

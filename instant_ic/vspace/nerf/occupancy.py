@@ -1,4 +1,4 @@
-"""Occupancy grid around the prior's surfaces: only there rendering queries the field."""
+"""Occupancy grid around the keyframes' surfaces. Rendering queries the field only in occupied cells."""
 
 from __future__ import annotations
 
@@ -17,17 +17,17 @@ from instant_ic.vspace.prior import ROOM, PanoramaPrior
 MAX_DISTANCE = 100
 MARGIN_CELLS = 2
 _MAX_PARTS = 16
-MAX_CELLS = 6_000_000  # of a grid, one byte each; its cells grow so that it has no more
+MAX_CELLS = 6_000_000  # limit of a grid, one byte per cell; in a large scene the cells grow instead
 
 
 @dataclass(frozen=True)
 class Occupancy:
-    """City-block distance in cells to the nearest occupied cell, 0 in it.
+    """A grid of distances to the nearest occupied cell.
 
     Attributes:
-        distance: (nx, ny, nz) uint8, at most ``MAX_DISTANCE``.
+        distance: city-block distance in cells, 0 in an occupied cell, at most ``MAX_DISTANCE``, (nx, ny, nz) uint8.
         origin: corner of cell (0, 0, 0) in the map frame, metres, (3,) float32.
-        cell_m: edge of a cell.
+        cell_m: edge of a cell in metres.
     """
 
     distance: NDArray[np.uint8]
@@ -36,11 +36,11 @@ class Occupancy:
 
 
 def surface_points(prior: PanoramaPrior, cell_m: float) -> NDArray[np.float32]:
-    """Return points of the keyframe's surfaces in the map, (N, 3), dense enough to leave no gap of a cell.
+    """Return points of the keyframe's surfaces in the map, (N, 3), without gaps as wide as a cell.
 
-    Quads of the room without a depth edge are divided where their corners are further apart than a cell (slanted
-    planes), up to 16 × 16 parts. Along a quad the inverse depth is linear. An infinite ``cell_m`` gives the pixels'
-    own points.
+    Quads of pixels on the room without a depth edge are divided into up to 16 × 16 parts if their corners are further
+    apart than a cell, as on slanted planes. Within a quad the inverse depth is linear. With an infinite ``cell_m`` only
+    the points of the pixels are returned.
     """
     height, width = prior.inverse_depth.shape
     directions = equirect_directions(width, height)
@@ -56,7 +56,7 @@ def surface_points(prior: PanoramaPrior, cell_m: float) -> NDArray[np.float32]:
     parts = np.ceil(np.maximum(down, across) / cell_m)
     parts = 2 ** np.ceil(np.log2(np.clip(parts, 1, _MAX_PARTS))).astype(np.intp)
     right = np.roll(room, -1, 1)
-    whole = room[:-1] & right[:-1] & room[1:] & right[1:]  # a corner in the sky may lie outside of all rooms
+    whole = room[:-1] & right[:-1] & room[1:] & right[1:]  # the sky's corners may lie outside the grid
     parts[(prior.depth_edge[:-1] > 0) | ~whole] = 1
     for count in np.unique(parts):
         if count == 1:
@@ -76,9 +76,9 @@ def surface_points(prior: PanoramaPrior, cell_m: float) -> NDArray[np.float32]:
 
 
 def build_occupancy(priors: Sequence[PanoramaPrior], config: GeometryConfig) -> Occupancy:
-    """Build the occupancy grid of keyframes' surfaces; ``MARGIN_CELLS`` are added around each surface."""
+    """Build the occupancy grid of the keyframes' surfaces, with a margin of ``MARGIN_CELLS`` around them."""
     corners = np.concatenate([surface_points(prior, math.inf) for prior in priors])
-    low, high = corners.min(axis=0), corners.max(axis=0)  # parts of quads lie between their corners
+    low, high = corners.min(axis=0), corners.max(axis=0)  # encloses the divided quads too
     volume = float(np.prod((high - low).astype(np.float64) + 8 * config.cell_m))
     cell = max(config.cell_m, (volume / MAX_CELLS) ** (1 / 3))
     origin = low - np.float32(4 * cell)
@@ -88,13 +88,13 @@ def build_occupancy(priors: Sequence[PanoramaPrior], config: GeometryConfig) -> 
         index = ((surface_points(prior, cell) - origin) * np.float32(1 / cell)).astype(np.intp)
         distance.reshape(-1)[np.ravel_multi_index(tuple(index.T), shape)] = 0
     _spread(distance)
-    # A margin for surfaces between the samples, for steps, and for the field's own small differences from the prior.
+    # The margin covers surfaces between samples, the ray's step length, and small deviations of the field's surface.
     distance -= np.minimum(distance, np.uint8(MARGIN_CELLS))
     return Occupancy(distance, origin.astype(np.float32), float(cell))
 
 
 def _spread(distance: NDArray[np.uint8]) -> None:
-    """Transform to city-block distances in place; this is exact, because the metric separates by axes."""
+    """Compute city-block distances in place. One pass per axis is exact, because the metric is a sum over the axes."""
     for axis in range(3):
         lines = np.moveaxis(distance, axis, 0)
         for order in (1, -1):

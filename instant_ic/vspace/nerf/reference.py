@@ -52,11 +52,10 @@ class TorchField:
 
 @dataclass
 class TorchPrior:
-    """A ``prior.PanoramaPrior`` as tensors.
+    """A ``prior.PanoramaPrior`` as tensors. ``known``, ``depth_edge`` and ``usable`` are bool.
 
     Attributes:
         rgb: colours, 0 to 255, float32.
-        known, depth_edge, usable: bool.
         trust: weight of each pixel's depth in the loss, (h, w).
         gain: colour factors that bring the keyframe to the newest one's exposure, (3,).
     """
@@ -88,7 +87,7 @@ class TrainState:
 
     Attributes:
         moments: two moments of Adam for each parameter.
-        level_rates: learning rate of each level against the coarsest's, (levels, 1, 1).
+        level_rates: learning rate of each level relative to the coarsest, (levels, 1, 1).
         steps: number of steps so far.
     """
 
@@ -106,7 +105,7 @@ def train_step(
     rates: tuple[float, float],
     weights: tuple[Tensor, Tensor],
 ) -> tuple[float, float]:
-    """Train a field with a signed distance as geometry for one step; update ``field`` and ``state`` in place.
+    """Train a field with distance geometry for one step; update ``field`` and ``state`` in place.
 
     Args:
         field: parameters and lattice.
@@ -118,7 +117,7 @@ def train_step(
         weights: weights of the samples' colours and distances in the loss, (2 N,) each (``field.sample_weights``).
 
     Returns:
-        Mean squared colour error (0 to 1 units) and mean squared distance error (in bands).
+        Mean squared colour error (colours 0 to 1) and mean squared distance error (in truncation distances).
     """
     state.steps += 1
     columns, rows = config.ray_columns, config.ray_rows
@@ -127,7 +126,7 @@ def train_step(
     output = query(field, points)
     colour, distance = loss(output, target, weights[0] * weight[:, 0], weights[1] * weight[:, 1])
     adam_step(field, state, torch.autograd.grad(colour + distance, field.parameters()), rates)
-    share = weight.mean(dim=0).clamp(min=1e-3)  # of the samples that count
+    share = weight.mean(dim=0).clamp(min=1e-3)  # mean weight, for errors per counted sample
     colour = colour / share[0] / (1 + BAND_COLOUR_WEIGHT)
     return float(colour.detach()), float((distance / share[1] / DISTANCE_WEIGHT).detach())
 
@@ -139,7 +138,7 @@ def adam_step(field: TorchField, state: TrainState, grads: tuple[Tensor, ...], r
         step_size: float | Tensor = adam_step_size(rates[min(index, 1)], state.steps)
         if index == 0:
             step_size = step_size * state.level_rates
-        # A row of the network is treated like an entry of the table: without a gradient it stays.
+        # Rows of the network without a gradient keep their values, like entries of the table.
         adam_touched(value, grad, *state.moments[index], step_size, BETA1, BETA2, EPSILON)
 
 
@@ -305,10 +304,7 @@ def _sample_rays(
 
 
 def prior_agrees(prior: TorchPrior, points: Tensor) -> Tensor:
-    """Return whether points (N, 3) in the camera's frame lie on the keyframe's surface: 0, 1 or 2.
-
-    0: no; 1: yes, but its depth was filled there; 2: yes, and its depth is known there.
-    """
+    """Return 2 for points (N, 3) in the camera's frame on a surface of known depth, 1 on filled depth, 0 elsewhere."""
     inverse = prior.inverse_depth
     height, width = inverse.shape
     distance = points.norm(dim=1)
@@ -323,7 +319,7 @@ def prior_agrees(prior: TorchPrior, points: Tensor) -> Tensor:
 
 
 def prior_distance(prior: TorchPrior, points: Tensor) -> Tensor:
-    """Return the signed distance of points (N, 3) in the camera's frame to the keyframe's surface, in bands, (N,)."""
+    """Return the distances (N,) from points in the camera's frame to the surface behind, in truncation distances."""
     nearness = prior_inverse_depth(prior, *_pixels(points, prior.inverse_depth))
     return (1 - points.norm(dim=1) * nearness) / prior.band
 
@@ -335,7 +331,7 @@ def _camera_frame(prior: TorchPrior, points: Tensor) -> Tensor:
 def nearest_prior(priors: list[TorchPrior], points: Tensor) -> tuple[Tensor, Tensor]:
     """Return signed distance to the nearest keyframe's surface and agreement of points (N, 3) in the map, (N,) each.
 
-    A keyframe that sees known depth far behind a point has looked through it: older keyframes do not count there.
+    If a keyframe sees known depth far behind a point, the point is free space and older keyframes do not count there.
     """
     seen_through = torch.zeros(points.shape[0], dtype=torch.bool, device=points.device)
     for k, prior in enumerate(priors):
@@ -390,7 +386,7 @@ def mix_panorama(
 def trace(
     field: TorchField, grid: TorchGrid, priors: list[TorchPrior], share: float, origin: Tensor, directions: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """March rays to the surface; return depth along each ray, 0 where it meets nothing, and confidence, (N,) each.
+    """March rays to the surface; return depth along each ray, 0 where it hits nothing, and confidence, (N,) each.
 
     Args: as ``march.trace``.
     """
@@ -443,7 +439,7 @@ def _grid_span(origin: Tensor, directions: Tensor, grid: TorchGrid) -> tuple[Ten
 
 
 def _next_occupied(origin: Tensor, directions: Tensor, t: Tensor, leave: Tensor, grid: TorchGrid) -> Tensor:
-    """Return the first depth from ``t`` on that lies in an occupied cell, (N,); −1 beyond ``leave``."""
+    """Return each ray's first length from ``t`` on that lies in an occupied cell, (N,); −1 if it is past ``leave``."""
     t = t.clone()
     shape = grid.distance.shape
     limit = torch.tensor(shape, device=t.device) - 1

@@ -1,4 +1,4 @@
-"""Training and rendering on an NVIDIA GPU by the Triton kernels; a training step is one CUDA graph."""
+"""Training and rendering on an NVIDIA GPU with the Triton kernels. A training step is one CUDA graph."""
 
 from __future__ import annotations
 
@@ -38,14 +38,14 @@ from instant_ic.vspace.nerf import triton_kernels as kernels
 
 TRAIN_BLOCK = 64
 ENTRIES = 256
-"""Table entries of one program of Adam; the smallest table has four times as many."""
+"""Table entries that one program of Adam updates. Every table has a multiple of it."""
 TILE = 64
-"""Rays of one program: an 8 × 8 tile of a batch's strata or of a view."""
+"""Rays that one program handles: an 8 × 8 tile of a batch's strata or of a view."""
 
 
 @dataclass
 class _Parameters:
-    """``master``: table as float32, ``table``: the same as float16, which the kernels read; ``network``: flat."""
+    """A field's parameters: table as float32 (``master``) and as float16 for the kernels, and network as one vector."""
 
     master: Tensor
     table: Tensor
@@ -54,7 +54,7 @@ class _Parameters:
 
 @dataclass(frozen=True)
 class _GpuScene:
-    """A scene's arrays as tensors; shapes as in ``StackedPriors``, ``Lattice``, ``Occupancy``."""
+    """A scene's arrays as tensors, in the shapes of ``StackedPriors``, ``Lattice`` and ``Occupancy``."""
 
     priors: dict[str, Tensor]
     cells_per_m: Tensor
@@ -69,7 +69,7 @@ class _GpuScene:
 
 @dataclass
 class _StepBuffers:
-    """Buffers of a training step: they stay where they are, as the graph has their addresses."""
+    """Buffers of a training step. They are never reallocated, because the CUDA graph holds their addresses."""
 
     uniform: Tensor
     sources: Tensor
@@ -86,7 +86,7 @@ class _StepBuffers:
 
 
 def kernel_shape(field: FieldConfig) -> dict[str, int]:
-    """Return the kernels' compile-time arguments for a field's size; tiles are powers of two of at least 16."""
+    """Return the kernels' compile-time arguments for a field's size. Tile sizes are powers of two of at least 16."""
     return {
         "LEVELS": field.levels,
         "LP": max(_power_of_two(field.levels), 16 // field.features),
@@ -97,18 +97,18 @@ def kernel_shape(field: FieldConfig) -> dict[str, int]:
 
 
 class TritonDevice:
-    """See ``field.Device``. One thread at a time.
+    """Backend on an NVIDIA GPU (see ``field.Device``); not thread-safe.
 
     Args:
         device: ``cuda``; ``cpu`` for tests, with ``TRITON_INTERPRET=1``.
 
     Raises:
-        ValueError: a geometry that the kernels do not know.
+        ValueError: the kernels do not support the field's geometry.
     """
 
     def __init__(self, field: FieldConfig, train: TrainConfig, device: str = "cuda") -> None:
         if field.geometry != "distance":
-            raise ValueError(f"the Triton kernels know geometry distance only (got {field.geometry!r})")
+            raise ValueError(f"the Triton kernels support only distance as geometry (got {field.geometry!r})")
         self._train, self._device = train, device
         self.on_gpu = device == "cuda"
         self.name = f"{torch.cuda.get_device_name()} (triton)" if self.on_gpu else f"{device} (triton)"
@@ -129,7 +129,7 @@ class TritonDevice:
         self._forget()
 
     def set_scene(self, scene: TrainingScene, parameters: FieldParameters | None = None) -> None:
-        # Everything that needs memory comes first: without it the old scene stays whole.
+        # Allocate everything first, so that the old scene remains usable if memory runs out.
         loaded = self._p if parameters is None else self._uploaded(parameters)
         self._scene, self._p = self._uploaded_scene(scene), loaded
         self._forget()
@@ -144,7 +144,7 @@ class TritonDevice:
         b.rates.copy_(torch.from_numpy(rates))
         if scene.keyframes > 1 or self._steps == 1:
             b.sources.copy_(torch.from_numpy(ray_sources(scene.keyframes, len(b.sources), self._steps)))
-        # The first step compiles, which a capture does not allow; from the second on it is the graph.
+        # The first step compiles, which is not allowed during a capture. The second step captures the graph.
         if self.on_gpu and b.graph is None and self._steps == 2:
             b.graph = torch.cuda.CUDAGraph()
             with torch.cuda.graph(b.graph):
@@ -172,7 +172,7 @@ class TritonDevice:
         )  # fmt: skip
 
     def _launch_gradient(self, scene: _GpuScene) -> None:
-        """Sample the batch's rays and add its gradients to the buffers, which Adam clears."""
+        """Sample the batch's rays and add their gradients to the buffers. Adam clears the buffers."""
         b, p, q, train = self._buffers, self._p, scene.priors, self._train
         size = self._table_shape[1]
         height, width = q["rgb"].shape[1:3]
@@ -199,7 +199,7 @@ class TritonDevice:
         pixels = rows * columns
         directions, turn = self._lens(rays)
         view = self._tensor(np.concatenate([rays.origin, turn.reshape(-1)]))
-        room = -(-pixels // 4) * 4  # all three begin at 16 bytes, for which the kernel is compiled
+        room = -(-pixels // 4) * 4  # the compiled kernel needs all three outputs aligned to 16 bytes
         out = torch.empty(5 * room, device=self._device)
         colour, depth, confidence = out[: 3 * room], out[3 * room : 4 * room], out[4 * room :]
         height, width = q["rgb"].shape[1:3]
@@ -216,7 +216,7 @@ class TritonDevice:
         return colours, fetched[3 * room : 3 * room + pixels], fetched[4 * room : 4 * room + pixels]
 
     def _lens(self, rays: Rays) -> tuple[Tensor, Floats]:
-        """Return a view's directions on the GPU and their rotation into the map; a lens is uploaded once."""
+        """Return a view's directions on the GPU and their rotation into the map. Each lens is uploaded once."""
         if not isinstance(rays, LensRays):
             return self._tensor(rays.directions), np.eye(3, dtype=np.float32)
         if self._newest_lens is None or self._newest_lens[0] is not rays.lens:
@@ -280,7 +280,7 @@ class TritonDevice:
         )
 
     def _forget(self) -> None:
-        """Clear the moments and the graph, which has the addresses of the earlier scene and parameters."""
+        """Clear the moments and the graph, because the graph holds addresses of the earlier scene and parameters."""
         b = self._buffers
         for moment in (*b.table_moments, *b.network_moments, b.table_grad, b.network_grad):
             moment.zero_()
@@ -289,5 +289,5 @@ class TritonDevice:
 
 
 def _power_of_two(number: int) -> int:
-    """Return the smallest power of two that is no smaller."""
+    """Return the smallest power of two that is not less than ``number``."""
     return 1 << (number - 1).bit_length()

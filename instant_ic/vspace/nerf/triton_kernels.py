@@ -1,11 +1,11 @@
-"""The field's kernels for NVIDIA GPUs (Triton): training samples, gradient, Adam on touched entries, and views.
+"""The field's Triton kernels for NVIDIA GPUs: training samples, gradient, Adam on touched entries, and views.
 
 Each kernel's docstring names the torch functions of ``reference.py`` that compute the same. Only ``triton_device``
 imports this module. With ``TRITON_INTERPRET=1`` it runs on the CPU, for the tests.
 
 Kernels read a float16 copy of the table; Adam updates the float32 master. Sums are float32. Gradients are added
-atomically, so two runs differ in the last bits. Sizes from the configuration are compile-time constants; sizes that
-change with scenes and views are arguments, so nothing is compiled after the start.
+atomically, so two runs differ in the last bits. Sizes from the configuration are compile-time constants. Sizes that
+change with scenes and views are arguments, so nothing is compiled after start-up.
 """
 
 # mypy: disable-error-code="no-untyped-def"
@@ -16,7 +16,7 @@ from __future__ import annotations
 import triton
 import triton.language as tl
 
-_P1 = tl.constexpr(2654435761 - (1 << 32))  # factors of the hash as int32: products wrap, the low bits stay equal
+_P1 = tl.constexpr(2654435761 - (1 << 32))  # hash factors as int32: products wrap, and the low bits are the same
 _P2 = tl.constexpr(805459861)
 _PI = tl.constexpr(3.141592653589793)
 _NOT_SEEN = tl.constexpr(1e9)
@@ -42,7 +42,7 @@ def _atan2(y, x):
 
 @triton.jit
 def _corner(ix, iy, iz, fx, fy, fz, size, corner: tl.constexpr):
-    """Return the entry in the level's table and the trilinear weight of one of a cell's eight corners."""
+    """Return the table entry and the trilinear weight of one of a cell's eight corners."""
     bx: tl.constexpr = corner & 1
     by: tl.constexpr = (corner >> 1) & 1
     bz: tl.constexpr = corner >> 2
@@ -53,7 +53,10 @@ def _corner(ix, iy, iz, fx, fy, fz, size, corner: tl.constexpr):
 
 @triton.jit
 def _cells(cells_per_m, origin, focus, keyframes, px, py, pz, LEVELS: tl.constexpr, LP: tl.constexpr):
-    """Return each level's cells of points, the positions in them (0 to 1), and its weights there, (B, LP) each."""
+    """Return the cells of points in each level, the positions in the cells (0 to 1), and the level's weights.
+
+    Each result is (B, LP).
+    """
     level = tl.arange(0, LP)
     scale = tl.load(cells_per_m + level, mask=level < LEVELS, other=0.0)[None, :]
     pixel = px * 0 + 1e9
@@ -74,7 +77,7 @@ def _encode(
     table, size, cells_per_m, origin, focus, keyframes, px, py, pz, wanted,
     LEVELS: tl.constexpr, LP: tl.constexpr, F: tl.constexpr, B: tl.constexpr,
 ):  # fmt: skip
-    """Return the features of points, (B, LP · F); ``reference.encode``."""
+    """Return the features of points, (B, LP · F), like ``reference.encode``."""
     ix, iy, iz, fx, fy, fz, share = _cells(cells_per_m, origin, focus, keyframes, px, py, pz, LEVELS, LP)
     first = tl.arange(0, LP)[None, :] * size
     feature = tl.arange(0, F)[None, None, :]
@@ -89,7 +92,7 @@ def _encode(
 
 @triton.jit
 def _first_layer(network, IN: tl.constexpr, HIDDEN: tl.constexpr, LP: tl.constexpr, F: tl.constexpr, HP: tl.constexpr):
-    """Load weights (HP, LP · F) and biases (HP,) of the first layer, padded with 0."""
+    """Load weights (HP, LP · F) and biases (HP,) of the first layer, padded with zeros."""
     j, i = tl.arange(0, HP), tl.arange(0, LP * F)
     inside = (j[:, None] < HIDDEN) & (i[None, :] < IN)
     w1 = tl.load(network + j[:, None] * IN + i[None, :], mask=inside, other=0.0)
@@ -141,7 +144,7 @@ def _panorama_colour(rgb, gain, k, u, v, width, height, wanted, channel: tl.cons
 def _inverse_depth(inverse, depth_edge, k, u, v, width, height, wanted):
     """Return keyframe ``k``'s inverse depth: bilinear on a surface, nearest pixel at a depth edge.
 
-    Returns also the four values around it, the mark of a depth edge, and the index of the nearest pixel.
+    Also return the four values around the position, the mark of a depth edge, and the index of the nearest pixel.
     """
     left, right, top, bottom, fu, fv = _bilinear_corners(u, v, width, height)
     start = k * height * width
@@ -158,9 +161,10 @@ def _inverse_depth(inverse, depth_edge, k, u, v, width, height, wanted):
 
 @triton.jit
 def _against(inverse, depth_edge, known, poses, band, k, px, py, pz, width, height, wanted):
-    """Compare map points with keyframe ``k``; ``reference.prior_distance`` and ``reference.prior_agrees``.
+    """Compare map points with keyframe ``k``, like ``reference.prior_distance`` and ``reference.prior_agrees``.
 
-    Returns signed distance in its bands, agreement (0, 1, 2), the band in metres, and a mark of known depth.
+    Return signed distance in truncation distances, agreement (0, 1, 2), truncation distance in metres, and a mark of
+    known depth.
     """
     m = poses + 16 * k
     x = tl.load(m) * px + tl.load(m + 1) * py + tl.load(m + 2) * pz + tl.load(m + 3)
@@ -183,7 +187,7 @@ def _against(inverse, depth_edge, known, poses, band, k, px, py, pz, width, heig
 
 @triton.jit
 def _nearest_prior(inverse, depth_edge, known, poses, band, keyframes, px, py, pz, width, height, wanted):
-    """Return signed distance to the nearest keyframe's surface and agreement; ``reference.nearest_prior``."""
+    """Return signed distance to the nearest keyframe's surface and agreement, like ``reference.nearest_prior``."""
     best, unit = px * 0 + _NOT_SEEN, px * 0 + 1
     agrees, through = (px * 0).to(tl.int32), px * 0 > 1
     for k in range(keyframes):
@@ -203,7 +207,7 @@ def sample_rays(
     uniform, sources, rgb, inverse, depth_edge, usable, trust, map_poses, band, gain,
     columns, rows, width, height, w, h, points, target, weight, B: tl.constexpr,
 ):  # fmt: skip
-    """Sample one ray per stratum and two points per ray; ``reference.sample_rays``. One program per tile of 64 rays."""
+    """Sample a ray per stratum and two points per ray, like ``reference.sample_rays``. One program per 64 rays."""
     tile = tl.program_id(0)
     inside = tl.arange(0, B)
     n = tile * B + inside
@@ -239,7 +243,7 @@ def sample_rays(
         colour = _panorama_colour(rgb, gain, k, u, v, width, height, every, c) - 0.5
         tl.store(target + 4 * surface + c, colour)
         tl.store(target + 4 * near + c, colour)
-    # Distances are in bands of the newest keyframe.
+    # Distances are in truncation distances of the newest keyframe.
     other = half * depth / (tl.load(band) * tl.maximum(tl.sqrt(away), 0.5 * depth))
     tl.store(target + 4 * surface + 3, depth * 0)
     tl.store(target + 4 * near + 3, -offset * tl.where(k > 0, other, 1.0))
@@ -260,9 +264,9 @@ def gradient(
     LEVELS: tl.constexpr, LP: tl.constexpr, F: tl.constexpr,
     HIDDEN: tl.constexpr, HP: tl.constexpr, B: tl.constexpr,
 ):  # fmt: skip
-    """Add the gradient of ``reference.loss`` of ``reference.query`` to ``table_grad`` and ``network_grad``.
+    """Add the gradient of ``reference.loss(reference.query(…))`` to ``table_grad`` and ``network_grad``.
 
-    Add the weighted squared errors of colour and distance, and the sums of their weights, to ``sums`` (4,).
+    Also add the weighted squared errors of colour and distance, and the sums of their weights, to ``sums`` (4,).
     """
     IN: tl.constexpr = LEVELS * F
     n = tl.program_id(0) * B + tl.arange(0, B)
@@ -317,9 +321,9 @@ def gradient(
 def adam_table(
     table, half_table, table_grad, m, v, step_size, size, beta1, beta2, epsilon, F: tl.constexpr, B: tl.constexpr
 ):
-    """Update the entries that have a gradient by one Adam step, and clear it; ``reference.adam_touched``.
+    """Update entries that have a gradient by one Adam step, like ``reference.adam_touched``, and clear the gradient.
 
-    Write the new values to ``half_table`` as float16 too. One program per ``B`` entries of one level.
+    The new values are also written to ``half_table`` as float16. One program per ``B`` entries of one level.
     """
     entry = tl.program_id(0).to(tl.int64) * B + tl.arange(0, B)
     at = entry[:, None] * F + tl.arange(0, F)[None, :]
@@ -338,7 +342,7 @@ def adam_table(
 
 @triton.jit
 def adam_network(network, network_grad, m, v, step_size, beta1, beta2, epsilon, COUNT: tl.constexpr, B: tl.constexpr):
-    """Update the whole network by one Adam step, and clear its gradient. One program."""
+    """Update the whole network by one Adam step, and clear its gradient. Runs as one program."""
     at = tl.arange(0, B)
     inside = at < COUNT
     g = tl.load(network_grad + at, mask=inside, other=0.0)
@@ -367,7 +371,7 @@ def _cell(o, t, d, low, cell, count):
 
 @triton.jit
 def _turned_ray(directions, turn, at, inside):
-    """Load the directions of pixels and turn them into the map."""
+    """Load the directions of pixels and rotate them into the map's frame."""
     vx = tl.load(directions + 3 * at, mask=inside, other=1.0)
     vy = tl.load(directions + 3 * at + 1, mask=inside, other=0.0)
     vz = tl.load(directions + 3 * at + 2, mask=inside, other=0.0)
@@ -398,7 +402,7 @@ def _distance(
     LEVELS: tl.constexpr, LP: tl.constexpr, F: tl.constexpr,
     HIDDEN: tl.constexpr, HP: tl.constexpr, B: tl.constexpr,
 ):  # fmt: skip
-    """Return the signed distance of points: the keyframes' with weight ``depth_share``, else the field's."""
+    """Return the signed distance of points, mixed from the keyframes' (weight ``depth_share``) and the field's."""
     value = px * 0
     if depth_share > 0:
         of_prior, _ = _nearest_prior(inverse, depth_edge, known, poses, band, keyframes, px, py, pz, w, h, active)
@@ -423,7 +427,7 @@ def _mix_panorama(
     red, green, blue, rgb, gain, inverse, depth_edge, known, poses, band, keyframes, px, py, pz, width, height, w, h,
     waiting, panorama_share,
 ):  # fmt: skip
-    """Mix in the colour of the newest keyframe that shows each point; ``reference.mix_panorama``."""
+    """Mix in the colour of the newest keyframe that shows each point, like ``reference.mix_panorama``."""
     for k in range(keyframes):
         m = poses + 16 * k
         x0 = tl.load(m) * px + tl.load(m + 1) * py + tl.load(m + 2) * pz + tl.load(m + 3)
@@ -447,7 +451,7 @@ def _march(
     LEVELS: tl.constexpr, LP: tl.constexpr, F: tl.constexpr,
     HIDDEN: tl.constexpr, HP: tl.constexpr, B: tl.constexpr,
 ):  # fmt: skip
-    """March rays to the surface and return depth and confidence; ``reference.trace``."""
+    """March rays to the surface and return depth and confidence, like ``reference.trace``."""
     near_band = tl.load(band)
     t, leave = _span(ox, dx, gx, nx * cell, dx * 0, dx * 0 + 1e9)
     t, leave = _span(oy, dy, gy, ny * cell, t, leave)
@@ -491,7 +495,7 @@ def render_rays(
     LEVELS: tl.constexpr, LP: tl.constexpr, F: tl.constexpr,
     HIDDEN: tl.constexpr, HP: tl.constexpr, B: tl.constexpr,
 ):  # fmt: skip
-    """Render a view: march to the surface, query the field's colour there, and mix in the panorama's.
+    """Render a view: march to the surface, query the field's colour there, and mix in the panorama's colour.
 
     Combines ``reference.trace``, ``reference.query`` and ``reference.mix_panorama``. One program per 8 × 8 pixels.
 
@@ -501,7 +505,7 @@ def render_rays(
         turn: map_from_view rotation, (3, 3).
         directions: unit rays in the view's frame, (P, 3).
         colour: result, 0 to 1, (P, 3).
-        depth: result in metres along each ray, (P,); 0 where it meets nothing.
+        depth: result in metres along each ray, (P,); 0 where it hits nothing.
         confidence: result, (P,).
     """
     IN: tl.constexpr = LEVELS * F

@@ -1,14 +1,14 @@
-"""Operations on table entries as machine vectors, which numba does not produce by itself (intrinsics in LLVM IR).
+"""Operations on table entries as machine vectors, written as LLVM intrinsics because numba does not vectorise them.
 
 ``gather`` (rows, entries, weights) → tuple of 4 float32:
     ``Σ weights[c] · rows[entries[c]]`` over the eight corners of a cell.
 ``scatter`` (rows, entries, weights, upstream):
     ``rows[entries[c]] += weights[c] · upstream``, corner by corner.
 ``adam`` (rows, grad, m, v, entry, step, beta1, beta2, epsilon):
-    one step of Adam on ``rows[entry]`` and its moments, all of ``rows``' shape; clears ``grad[entry]``.
+    one step of Adam on ``rows[entry]`` and its moments, all in the shape of ``rows``; clears ``grad[entry]``.
 
-``rows`` (size, 4) float32, C-contiguous; ``entries`` and ``weights`` are tuples of eight uint32 and eight float32;
-``upstream`` one of 4 float32. Nothing is checked.
+``rows`` is (size, 4) float32, C-contiguous. ``entries`` and ``weights`` are tuples of eight uint32 and eight float32,
+``upstream`` is a tuple of 4 float32. Arguments are not checked.
 """
 
 from __future__ import annotations

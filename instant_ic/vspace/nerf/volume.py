@@ -1,8 +1,8 @@
-"""Geometry as density, as in the paper: compositing of samples around the depth, with its gradient (numba).
+"""Density geometry, as in the paper: compositing of samples around the depth, and its gradient (numba).
 
-The network's output 3 is the logarithm of the density, per band of the newest keyframe (``band · distance to its
-camera`` metres), so that near and far walls look alike to the network. ``tests/vspace/volume_reference.py`` computes
-the same in torch.
+The network's output 3 is the logarithm of the density per truncation distance of the newest keyframe. That distance
+is ``band · distance to the camera``, so that near and far walls look alike to the network.
+``tests/vspace/volume_reference.py`` computes the same in torch.
 """
 
 from __future__ import annotations
@@ -29,14 +29,17 @@ _RAYS = BLOCK // SAMPLES
 
 @njit(**_OPTIONS)
 def band_samples(camera, surface, jitter, band, newest, newest_band, points, first, offset, span):  # type: ignore[no-untyped-def]
-    """Place the samples of one ray through the band around its surface.
+    """Place the samples of one ray within the truncation distance on both sides of its surface.
 
     Args:
-        camera, surface: (3,); jitter: place in the strata, 0..1; band: half width, share of the depth.
-        newest: the newest keyframe's camera, (3,); newest_band: its band.
-        points: out, rows ``first``… of (…, 3).
-        offset: out, (SAMPLES,): distance behind the surface, in bands of the ray.
-        span: out, (SAMPLES,): length that a sample stands for, in bands of the newest keyframe.
+        camera, surface: start and end of the ray in the map, (3,) each.
+        jitter: position of the samples in their strata, 0 to 1.
+        band: truncation distance as a share of the depth.
+        newest: position of the newest keyframe's camera, (3,).
+        newest_band: ``band`` of the newest keyframe.
+        points: sampled points, (…, 3); rows from ``first`` on are written.
+        offset: distance behind the surface, in truncation distances of the ray, (SAMPLES,); written.
+        span: length of each sample's interval, in truncation distances of the newest keyframe, (SAMPLES,); written.
     """
     step = np.float32(2.0 / SAMPLES)
     depth = np.float32(0)
@@ -55,9 +58,9 @@ def band_samples(camera, surface, jitter, band, newest, newest_band, points, fir
 
 @njit(**_OPTIONS)
 def ray_weights(raw, first, span, weight, left):  # type: ignore[no-untyped-def]
-    """Return the weights of a ray's samples and the light left after each, (SAMPLES,) each.
+    """Write the weight of each sample of a ray, and the transmittance behind it to ``left``, (SAMPLES,) each.
 
-    ``raw``: logarithms of the density, entries ``first``….
+    ``raw`` holds the logarithms of the density, from entry ``first`` on.
     """
     light = np.float32(1)
     for s in range(SAMPLES):
@@ -70,14 +73,16 @@ def ray_weights(raw, first, span, weight, left):  # type: ignore[no-untyped-def]
 
 @njit(**_OPTIONS)
 def _ray_gradient(y, first, target, weight, w, left, offset, span, losses, each, pull, dy):  # type: ignore[no-untyped-def]
-    """Write the gradient of one ray's loss by the network's outputs, and return its colour and depth errors.
+    """Write the gradient of one ray's loss with respect to the network's outputs; return colour and depth errors.
 
     Args:
         y, dy: outputs of the network and their gradient, (4, BLOCK); the ray's samples begin at ``first``.
-        target: colour of the ray, (3,) and more; weight: of colour and depth, (2,).
-        w, left, offset, span: weights of ``ray_weights`` and places of ``band_samples``, (SAMPLES,).
-        losses, each: weights of the losses and of a ray.
-        pull: scratch, (SAMPLES,).
+        target: colour of the ray, in the first three entries.
+        weight: weights of colour and depth, (2,).
+        w, left, offset, span: results of ``ray_weights`` and ``band_samples``, (SAMPLES,) each.
+        losses: weights of the losses, see ``volume_gradient``.
+        each: weight of a ray.
+        pull: scratch memory, (SAMPLES,).
     """
     step = np.float32(2.0 / SAMPLES)
     by_colour, by_depth = each * weight[0], each * weight[1] * losses[0]
@@ -118,18 +123,20 @@ def volume_gradient(  # type: ignore[no-untyped-def]
 ):  # fmt: skip
     """Add the gradient of the training loss of composited rays to the ``*_grad`` arrays.
 
-    Loss of a ray, times its weight, mean over the rays: ``|Σ w c − colour|² / 3 + losses[0] · depth + losses[1] ·
-    opacity + losses[2] · distortion`` with ``depth = (Σ w o)²``, ``opacity = (1 − Σ w)²`` and ``distortion =
-    Σᵢⱼ wᵢ wⱼ |oᵢ − oⱼ| + ⅓ Σ wᵢ² · step`` (Barron et al., 2022), o in bands behind the surface.
+    The loss is the weighted mean over the rays of ``|Σ w c − colour|² / 3 + losses[0] · depth + losses[1] · opacity +
+    losses[2] · distortion`` with ``depth = (Σ w o)²``, ``opacity = (1 − Σ w)²`` and ``distortion =
+    Σᵢⱼ wᵢ wⱼ |oᵢ − oⱼ| + ⅓ Σ wᵢ² · step`` (Barron et al., 2022), where o is ``offset`` of ``band_samples``.
 
     Args:
         points, target, weight: results of ``march.sample_rays``; the first 64 of each tile's 128 rows are used.
-        jitter: (N,) place of each ray's samples in their strata, 0..1.
-        sources: (N / 64,) each tile's keyframe; cameras: (K, 3); band: (K,).
+        jitter: position of each ray's samples in their strata, 0 to 1, (N,).
+        sources: keyframe of each tile, (N / 64,).
+        cameras: positions of the keyframes' cameras, (K, 3).
+        band: truncation distances of the keyframes as shares of the depth, (K,).
         losses: weights of depth, opacity and distortion, (3,).
 
     Returns:
-        Mean squared colour error (0..1 units) and mean squared depth error (bands), not weighted by ``losses``.
+        Mean squared errors of colour (0 to 1) and depth (in truncation distances), not weighted by ``losses``.
     """
     x, dx = np.zeros((w1.shape[1], BLOCK), np.float32), np.zeros((w1.shape[1], BLOCK), np.float32)
     h, dh = np.zeros((w1.shape[0], BLOCK), np.float32), np.zeros((w1.shape[0], BLOCK), np.float32)
@@ -170,11 +177,13 @@ def volume_gradient(  # type: ignore[no-untyped-def]
 
 @njit(**_OPTIONS)
 def _guided_samples(origin, direction, depth, newest, band, points, first, offset, span):  # type: ignore[no-untyped-def]
-    """Place a view's samples around the depth of one ray, and return the half width of their band.
+    """Place a view's samples around the depth of one ray, and return their truncation distance as a share of it.
 
     Args:
-        origin, direction: (3,); depth: metres along the ray.
-        newest, band, points, first, offset, span: as in ``band_samples``.
+        origin, direction: position of the view and unit vector of the ray in the map, (3,) each.
+        depth: metres along the ray.
+        newest, points, first, offset, span: as in ``band_samples``.
+        band: ``band`` of the newest keyframe.
     """
     half, away = np.float32(0.5), np.float32(0)
     surface = np.empty(3, np.float32)
@@ -188,12 +197,12 @@ def _guided_samples(origin, direction, depth, newest, band, points, first, offse
 
 @njit(**_OPTIONS)
 def _composited(y, first, w, offset, colour):  # type: ignore[no-untyped-def]
-    """Write the colour of a ray (3,), and return the mean place of its samples in the band.
+    """Write the colour of a ray, and return the weighted mean of its samples' offsets.
 
     Args:
         y: outputs of the network, (4, BLOCK); the ray's samples begin at ``first``.
-        w, offset: weights and places of the samples, (SAMPLES,).
-        colour: out, 0..1, (3,).
+        w, offset: weights and offsets of the samples, (SAMPLES,) each.
+        colour: colour of the ray, 0 to 1, (3,); written.
     """
     opacity, mean, half = np.float32(1e-6), np.float32(0), np.float32(0.5)
     red, green, blue = np.float32(0), np.float32(0), np.float32(0)
@@ -213,14 +222,15 @@ def _composited(y, first, w, offset, colour):  # type: ignore[no-untyped-def]
 def composite(  # type: ignore[no-untyped-def]
     table, w1, b1, w2, b2, cells_per_m, lattice_origin, focus, band, depth_share, origin, directions, depth, colour
 ):
-    """Render rays by compositing around their guiding depth: hash grid, network and sums in one pass.
+    """Render rays by compositing samples around the depth that the keyframes give.
 
     Args:
-        band: truncation distance of the newest keyframe, whose camera is ``focus[0, :3]``.
-        depth_share: weight of the guiding depth in the resulting depth; the rest is the mean over the samples.
-        origin: (3,); directions: (P, 3).
-        depth: in and out, (P,): metres along the ray, 0 where it meets nothing.
-        colour: out, (P, 3) in 0..1, before a mid-grey ground as in training; not written where nothing is met.
+        band: truncation distance of the newest keyframe as a share of the depth; its camera is ``focus[0, :3]``.
+        depth_share: weight of the given depth in the result; the mean over the samples has the remaining weight.
+        origin: position of the view in the map, (3,).
+        directions: unit vectors of the rays in the map, (P, 3).
+        depth: metres along each ray, 0 where it hits nothing, (P,); updated in place.
+        colour: RGB on mid-grey, as in training, 0 to 1, (P, 3); written where the ray hits a surface.
     """
     x = np.zeros((w1.shape[1], BLOCK), np.float32)
     h = np.zeros((w1.shape[0], BLOCK), np.float32)
