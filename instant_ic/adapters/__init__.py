@@ -1,1 +1,1 @@
-"""Conversion of messages to the plain values of the algorithms and back, one module a part."""
+"""Conversion between messages and the plain values of the algorithms, one module per part of the stack."""

@@ -1,4 +1,4 @@
-"""Messages of the node ``crawler_base`` to the plain values of ``instant_ic.base``, and back."""
+"""Conversion between messages of the node ``crawler_base`` and the plain values of ``instant_ic.base``."""
 
 from __future__ import annotations
 
@@ -23,16 +23,16 @@ _TWISTS = (type_name(TwistStamped), type_name(Twist))
 
 
 class BaseCommand(NamedTuple):
-    """A command of ``/cmd_vel``: v in m/s, w in rad/s."""
+    """A command from ``/cmd_vel``: v in m/s, w in rad/s."""
 
     v: float
     w: float
     stamp_ns: int
-    """0 without a stamp."""
+    """Stamp of the message; 0 without one."""
     given_ns: int
     """Time of the command on the steady clock."""
     hard: bool
-    """Stop without the soft ramp."""
+    """True for a stop at the hard deceleration."""
 
 
 def read_command(received: Received) -> BaseCommand:
@@ -51,7 +51,7 @@ def read_command(received: Received) -> BaseCommand:
 
 
 def estimate_message(estimate: OdometryEstimate) -> Any:
-    """Return the odometry of an estimate."""
+    """Return the Odometry message of an estimate."""
     v, lateral, w = (float(part) for part in estimate.twist)
     covariances = (estimate.pose_covariance, estimate.twist_covariance)
     odom_from_base = matrix_from_pose2(estimate.pose)

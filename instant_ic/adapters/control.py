@@ -1,4 +1,4 @@
-"""Messages of the control topics to the plain values of ``instant_ic.control``, and back."""
+"""Conversion between messages of the control topics and the plain values of ``instant_ic.control``."""
 
 from __future__ import annotations
 
@@ -50,26 +50,26 @@ from instant_ic.util.contradiction import Contradiction
 
 @dataclass
 class ArbiterInbox:
-    """Newest messages of the arbiter's topics, as the inputs of its step."""
+    """Newest messages of the arbiter's topics, from which the inputs of its step are made."""
 
     clock: Clock
     surroundings: Surroundings
     view: OperatorView
     sources: dict[str, Latest]
-    """scan, odometry, pose, vbot, nav and command."""
+    """Newest messages by source: scan, odometry, pose, vbot, nav and command."""
     points: Latest | None
-    """3D points; None: not used."""
+    """Newest 3D points; None if they are not used."""
     shown: Latest
     vspace: Latest
     integrity: Latest | None = None
-    """Trust in the pose; None: not used."""
+    """Newest trust in the pose; None if it is not used."""
     gate: CommandGate = field(default_factory=lambda: command_gate(TimeoutConfig()))
-    """Decides who drives the robot."""
+    """Gate with the lease of the node that drives the robot."""
     button_ns: int | None = None
-    """Last report of the robot's own emergency stop, steady clock."""
-    _was_gone: bool = False  # at the page's last report
-    _shown_by: str = ""  # node of that report
-    _zeros_of: str = ""  # sender of the last zero
+    """Steady time of the last report of the robot's own emergency stop."""
+    _was_gone: bool = False  # whether the driver was gone at the page's last report
+    _shown_by: str = ""  # node that sent this report
+    _zeros_of: str = ""  # sender of the last zero command
 
     def scan(self) -> ArrivedScan | None:
         """Return the newest scan."""
@@ -81,7 +81,7 @@ class ArbiterInbox:
         return ArrivedScan(m.header.frame_id, stamp_ns(m), self._arrived_ns(latest), *beams)
 
     def cloud(self) -> ArrivedCloud | None:
-        """Return the newest 3D points; a message that cannot be read is reported to the surroundings."""
+        """Return the newest 3D points. An unreadable message is reported to the surroundings."""
         if self.points is None or self.points.message is None:
             return None
         message = self.points.message
@@ -93,33 +93,33 @@ class ArbiterInbox:
         return ArrivedCloud(message.header.frame_id, stamp_ns(message), self._arrived_ns(self.points), points)
 
     def rests(self, mode: Mode) -> bool:
-        """Return whether the robot stands and nobody wants it to move: nothing then depends on the newest scan."""
+        """Return whether the robot stands and no command moves it, so that nothing depends on the newest scan."""
         still = self._twist("command") == NO_MOTION == self._twist("odometry")
         return still and mode in (Mode.REAL, Mode.STOPPED)
 
     @property
     def lease(self) -> Lease:
-        """Who drives the robot."""
+        """The lease of the node that drives the robot."""
         assert self.gate.lease is not None
         return self.gate.lease
 
     def take_command(self, received: Received) -> bool:
-        """Take a command if its sender has the robot's lease, or gets it; return whether it was taken.
+        """Take a command if its sender holds or now gets the robot's lease. Return whether it was taken.
 
         Args:
-            received: TwistStamped; its frame names the client of the node that published it.
+            received: TwistStamped whose frame names the client of the publishing node.
         """
         message = deserialize(received.payload, received.type_name)
         twist = twist_values(message)
         if self.gate.check_twist(*twist) is not None:
-            return False  # neither a motion nor a release: it refreshes no age
+            return False  # an invalid twist refreshes no age
         sender, given_ns = f"{received.publisher}/{message.header.frame_id}", received.given_ns(stamp_ns(message))
         moves = twist != NO_MOTION
         if sender.endswith(RELEASED):
             taken = not moves and self.lease.release(sender.removesuffix(RELEASED))
         else:
             now_ns = self.clock.steady_ns()
-            # The holder's command is taken at any age, which counts from then on; another sender's must be recent.
+            # The holder's command is taken at any age, and its age then counts. Another sender's must be recent.
             age_s = 0.0 if sender == self.lease.holder else (now_ns - given_ns) / 1e9
             stands = self._stands()
             taken = self.gate.admit(*twist, age_s, sender, now_ns, given_ns=given_ns, stands=stands) is None
@@ -130,13 +130,13 @@ class ArbiterInbox:
         if taken:
             self.sources["command"].put(message, received)
         else:
-            self.sources["command"].note(received)  # a restarted console is a new client, who has no lease yet
+            self.sources["command"].note(received)  # a restarted console is a new client without a lease
         return taken
 
     def take_shown(self, received: Received, mode: Mode) -> bool:
-        """Take a page's report; return whether to step at once: a switch waits for it, or the driver was lost.
+        """Take a page's report. Return whether to step at once, for a waiting switch or because the driver was lost.
 
-        While somebody drives, only reports of the node through which he drives count: no other page's images are his.
+        While the robot is driven, only reports of the driver's node count, because only its pages show his images.
         """
         if not self._counts(received.publisher):
             return False
@@ -163,7 +163,7 @@ class ArbiterInbox:
         return shown is not None and command is not None and stamp_ns(command) <= stamp_ns(shown.operator_lost)
 
     def ages(self, timeouts: TimeoutConfig, points_every_s: float = 0.0) -> dict[str, float]:
-        """Return seconds since the newest message of each source, as ``ArbiterInputs.ages``."""
+        """Return the seconds since the newest message of each source, for ``ArbiterInputs.ages``."""
         now_ns, steady_ns = self.clock.now_ns(), self.clock.steady_ns()
         ages = {key: _age_s(latest) for key, latest in self.sources.items()} | {"vspace": self.vspace.age_s}
         ages |= self.view.ages(page_report(self.shown.message), self.shown.age_s, steady_ns)
@@ -177,7 +177,7 @@ class ArbiterInbox:
     def inputs(
         self, latch: KeptEstop, walls: WallMap | None, timeouts: TimeoutConfig, points_every_s: float = 0.0
     ) -> ArbiterInputs:
-        """Return the inputs of a step now; the costmap takes a sweep of points every ``points_every_s`` (0: each)."""
+        """Return the inputs of a step now. The costmap uses a sweep of points every ``points_every_s``; 0 uses all."""
         now_ns, steady_ns = self.clock.now_ns(), self.clock.steady_ns()
         view, surroundings = self.view, self.surroundings
         ages, near = self.ages(timeouts, points_every_s), surroundings.near_points(self.scan())
@@ -223,12 +223,12 @@ class ArbiterInbox:
         )
 
     def _counts(self, node: str) -> bool:
-        """Return whether the images at a node's pages are the driver's."""
+        """Return whether a node's pages show the driver's images."""
         return not self.lease.holder or self.lease.holder.startswith(f"{node}/")
 
     @property
     def command(self) -> tuple[float, float]:
-        """The holder's newest command (m/s, rad/s)."""
+        """The newest command of the lease's holder (m/s, rad/s)."""
         return self._twist("command")
 
     def _stands(self) -> bool:
@@ -244,17 +244,17 @@ class ArbiterInbox:
 
 
 def command_gate(timeouts: TimeoutConfig) -> CommandGate:
-    """Return the arbiter's gate: a recent command takes the robot's lease if that is free."""
+    """Return the arbiter's gate, where a recent command takes the robot's lease if it is free."""
     return CommandGate(command_limits(timeouts), Lease(LEASE_S))
 
 
 def command_limits(timeouts: TimeoutConfig) -> GateLimits:
-    """Return the limits of the arbiter's gate; the age of a command stamped ahead counts from its arrival."""
+    """Return the limits of the arbiter's gate. The age of a command with a future stamp counts from its arrival."""
     return GateLimits(max_age_s=timeouts.command, max_ahead_s=math.inf)
 
 
 def page_report(shown: ShownPictures | None) -> PageReport | None:
-    """Report of the operator's page; None without one."""
+    """Return the report of the operator's page; None without one."""
     if shown is None:
         return None
     return PageReport(
@@ -268,7 +268,7 @@ def page_report(shown: ShownPictures | None) -> PageReport | None:
 
 
 def command_message(decision: Decision, now_ns: int) -> TwistStamped:
-    """Return the message for ``/cmd_vel``; its frame demands a hard stop if the operator did not command the zero."""
+    """Return the message for ``/cmd_vel``. Its frame demands a hard stop if the decision does."""
     return twist_stamped(*decision.command, now_ns, HARD_STOP if decision.hard else "base_link")
 
 
@@ -301,16 +301,16 @@ def control_state(decision: Decision, inputs: ArbiterInputs, now_ns: int) -> Con
 
 def _pose_lost_probability(trust: PoseIntegrity | None) -> float:
     probability = 0.0 if trust is None else float(trust.lost_probability)
-    return probability if 0.0 <= probability <= 1.0 else 1.0  # NaN too: such a report is no reason to drive on
+    return probability if 0.0 <= probability <= 1.0 else 1.0  # NaN or out of range: do not trust the pose
 
 
 def _age_s(latest: Latest) -> float:
-    """Return seconds since the newest message, by its stamp; inf without one."""
+    """Return the seconds since the newest message by its stamp; inf without a message."""
     return math.inf if latest.message is None else latest.stamp_age_s
 
 
 def _present_pose(odometry: Odometry, now_ns: int) -> NDArray[np.float64]:
-    """Return the pose (3,) extrapolated to now: the message is up to a period old."""
+    """Return the pose (3,) extrapolated to now, because the message is up to a period old."""
     pose = pose2_from_message(odometry)
     return extrapolate(pose, twist_values(odometry), (now_ns - stamp_ns(odometry)) / 1e9)
 

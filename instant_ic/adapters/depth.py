@@ -1,4 +1,4 @@
-"""Messages of the node ``depth_scaler`` to the plain values of ``instant_ic.depth``, and back."""
+"""Conversion between messages of the node ``depth_scaler`` and the plain values of ``instant_ic.depth``."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def revolution_of(message: Any) -> TimedPoints:
     """Convert a PointCloud2 to a revolution.
 
     Raises:
-        ValueError: its points cannot be read, or have no times.
+        ValueError: the points cannot be read or have no times.
     """
     points = cloud_array(message)
     xyz = functools.partial(cloud_points, points)
@@ -30,7 +30,7 @@ def revolution_of(message: Any) -> TimedPoints:
 
 
 def keyframe_message(number: int, frame: str, frame_from_camera: Matrix, panorama: Any, depth: DepthResult) -> Any:
-    """Build the Keyframe message of a CompressedImage and its depth."""
+    """Build the Keyframe message from a CompressedImage and its depth."""
     camera, stamp = panorama.header.frame_id, stamp_ns(panorama)
     return Keyframe(
         header=header(frame, stamp),

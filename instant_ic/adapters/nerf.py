@@ -1,4 +1,4 @@
-"""Messages of the node ``nerf`` to the plain values of ``instant_ic.vspace``, and back."""
+"""Conversion between messages of the node ``nerf`` and the plain values of ``instant_ic.vspace``."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ from instant_ic.vspace.worker import EncodedView, KeyframeArrays, SpaceWorker, V
 
 
 def decode_keyframe(keyframe: Any) -> KeyframeArrays:
-    """Return the arguments of ``VirtualSpace.prepare``.
+    """Return the arrays of a Keyframe message, for ``VirtualSpace.prepare``.
 
     Raises:
-        KeyframeError: the keyframe is marked unfit, or cannot be decoded.
+        KeyframeError: the keyframe is marked unfit or cannot be decoded.
     """
     if not keyframe.fit:
         raise KeyframeError(f"its depth is marked unfit: {keyframe.message or 'no reason given'}")
@@ -42,7 +42,7 @@ def decode_keyframe(keyframe: Any) -> KeyframeArrays:
 
 
 def view_message(order: ViewOrder, encoded: EncodedView, worker: SpaceWorker, now_ns: int) -> Any:
-    """Build the RenderedView message of a request; its pose is that of the rendered request."""
+    """Build the RenderedView message that answers a request, with the pose of the rendered request."""
     return RenderedView(
         header=header("map", now_ns),
         request_id=order.id,

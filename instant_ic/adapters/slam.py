@@ -1,4 +1,4 @@
-"""Messages, transforms and background jobs of the node ``grid_slam``."""
+"""Conversion of messages and transforms, and the background jobs, of the node ``grid_slam``."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def read_scan(message: LaserScan, mounts: TransformBuffer) -> tuple[Scan, FloatA
     """Return the scan of a LaserScan, and the laser's planar mount (3,) on the robot.
 
     Raises:
-        ScanError: the mount is not known yet, or the scan cannot be used.
+        ScanError: the mount is not known yet or the scan cannot be used.
     """
     angles = (float(message.angle_min), float(message.angle_increment))
     limits = (float(message.range_min), float(message.range_max))
@@ -50,7 +50,7 @@ def read_scan(message: LaserScan, mounts: TransformBuffer) -> tuple[Scan, FloatA
 
 
 def integrity_message(slam: GridSlam, result: SlamResult, stamp: int) -> Any:
-    """Return the PoseIntegrity after a scan with this result."""
+    """Return the PoseIntegrity message after a scan with this result."""
     trust, found = result.integrity, slam.contradiction
     return PoseIntegrity(
         header=header("map", stamp),
@@ -65,7 +65,7 @@ def integrity_message(slam: GridSlam, result: SlamResult, stamp: int) -> Any:
 
 
 def pose_message(result: SlamResult, stamp: int) -> Any:
-    """Return the PoseWithCovarianceStamped after a scan."""
+    """Return the PoseWithCovarianceStamped message after a scan."""
     covariance = planar_covariance(result.covariance).reshape(36)
     pose = PoseWithCovariance(pose=_pose(matrix_from_pose2(result.map_from_base)), covariance=covariance)
     return PoseWithCovarianceStamped(header=header("map", stamp), pose=pose)
@@ -79,13 +79,13 @@ def read_mounts(message: TFMessage, mounts: TransformBuffer) -> None:
 
 
 def read_initial_pose(message: PoseWithCovarianceStamped) -> FloatArray:
-    """Return the pose (3,) that was set from outside.
+    """Return the pose (3,) of a robot that was set by hand.
 
     Raises:
-        ValueError: it is in another frame than the map's.
+        ValueError: the pose is in another frame than the map's.
     """
     if message.header.frame_id not in ("", "map"):
-        raise ValueError(f"it is in frame {message.header.frame_id!r}, not 'map'")
+        raise ValueError(f"the pose is in frame {message.header.frame_id!r}, not 'map'")
     return pose2_from_message(message)
 
 
@@ -101,7 +101,7 @@ def transforms(
     """Yield the transforms to broadcast after a scan: parent, child and parent_from_child (4, 4)."""
     if not with_odometry:
         yield "odom", "base_link", matrix_from_pose2(slam.frames.odom_from_base)
-    # A robot that is lost keeps the frames that it had: it may drive on, slowly, until its place is recognized.
+    # A lost robot keeps its last map→odom, so that it can drive on slowly until its place is recognized.
     if slam.in_map_frame:
         map_from_odom = limiter.follow(slam.frames.map_from_odom, slam.frames.odom_from_base, stamp_ns)
         yield "map", "odom", matrix_from_pose2(map_from_odom)
@@ -110,7 +110,7 @@ def transforms(
 
 
 class JobResult(NamedTuple):
-    """Outcome of a background job of one SLAM; None with a diagnosis if it failed."""
+    """Result of a background job of a SLAM; ``outcome`` is None, with a diagnosis, if the job failed."""
 
     slam: GridSlam
     outcome: FoundPlace | LoopOutcome | None
@@ -118,10 +118,10 @@ class JobResult(NamedTuple):
 
 
 def run_job(item: tuple[GridSlam, Callable[[], FoundPlace | LoopOutcome]]) -> JobResult:
-    """Run a ``background_job``, on any thread."""
+    """Run a ``background_job`` of a SLAM. Any thread may call this."""
     slam, job = item
     try:
         return JobResult(slam, job())
-    except Exception as error:  # noqa: BLE001 - scans go on
-        text = f"Loop closure has failed ({type(error).__name__}: {error}). Restart the node to use it again"
+    except Exception as error:  # noqa: BLE001 - a failed job must not stop the processing of scans
+        text = f"Loop closure failed ({type(error).__name__}: {error}). Restart the node to use it again"
         return JobResult(slam, None, Diagnosis("loops", Level.ERROR, text))

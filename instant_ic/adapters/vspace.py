@@ -1,4 +1,4 @@
-"""VspaceLayers messages from the layers of ``instant_ic.vspace.layers``, and back."""
+"""Conversion between VspaceLayers messages and the layers of ``instant_ic.vspace.layers``."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from instant_ic.vspace.layers import Kind, Layer, Layers, LayersError
 
 
 def layers_message(layers: Layers, stamp_ns: int) -> Any:
-    """Build the VspaceLayers message of a version; ``stamp_ns`` is its time."""
+    """Build the VspaceLayers message of a version of the layers, with its stamp."""
     return VspaceLayers(
         header=header("map", stamp_ns),
         version=layers.version,
@@ -48,13 +48,13 @@ def layers_of(message: Any) -> Layers:
     """Read the layers of a VspaceLayers message.
 
     Raises:
-        LayersError: a layer of an unknown kind.
-        ValueError: a pose that is none.
+        LayersError: a layer has an unknown kind.
+        ValueError: a pose is not valid.
     """
     found = []
     for layer in message.layers:
         if layer.kind not in tuple(Kind):
-            raise LayersError(f"layer of the unknown kind {layer.kind}: is the sender newer than this program?")
+            raise LayersError(f"layer of unknown kind {layer.kind}: is the sender newer than this program?")
         found.append(
             Layer(
                 kind=Kind(layer.kind),

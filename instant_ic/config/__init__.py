@@ -1,1 +1,1 @@
-"""Parameter schema shared by all nodes: dataclasses, their ranges, and the YAML files that override them."""
+"""Parameters of all nodes: dataclasses, the ranges of their fields, and the YAML files that override them."""

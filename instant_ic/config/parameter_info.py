@@ -1,4 +1,4 @@
-"""Description of a node's parameters: type, range, default, meaning, and whether they can be changed live."""
+"""Descriptions of a node's parameters: type, range, default, meaning, and whether they can be changed live."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ class ParameterInfo:
         type: type of the value, in Python notation.
         value: present value, as plain JSON.
         default: default value, as plain JSON.
-        range: allowed range as text; empty without a range.
-        live: true if it can be changed while the node runs.
+        range: allowed range as text; empty if there is none.
+        live: true if the parameter can be changed while the node runs.
     """
 
     name: str
@@ -39,7 +39,7 @@ class ParameterInfo:
 
 
 def is_live(key: str, live: Iterable[str]) -> bool:
-    """Return whether a key is live; ``live`` may also name whole groups, or everything by ``*``."""
+    """Return whether a key is live. ``live`` holds keys, groups of keys, or ``*`` for everything."""
     return any(entry in ("*", key) or key.startswith(f"{entry}.") for entry in live)
 
 
@@ -48,14 +48,14 @@ def parameter_infos(config_class: type[Any], config: Any = None, live: Iterable[
 
     Args:
         config_class: the configuration's class.
-        config: configuration that gives the present values; None uses the defaults.
-        live: keys and groups that can be changed while the node runs.
+        config: source of the present values; None uses the defaults.
+        live: keys and groups that can be changed while the node runs; see :func:`is_live`.
     """
     return [dataclasses.replace(info, live=is_live(info.name, live)) for info in _infos(config_class, config, None, "")]
 
 
 def _infos(config_class: type[Any], config: Any, defaults: Any, prefix: str) -> list[ParameterInfo]:
-    """Return the parameters of one group; ``defaults`` is the group as its parent creates it, None at the top."""
+    """Return the parameters of one group. ``defaults`` is the default value of the group; None at the top."""
     infos: list[ParameterInfo] = []
     meanings = attributes(config_class)  # type: ignore[arg-type]
     hints, bounds = get_type_hints(config_class), ranges(config_class)  # type: ignore[arg-type]
@@ -82,7 +82,7 @@ def _type_words(hint: Any) -> str:
 
 
 def plain(value: Any) -> Any:
-    """Return a value as JSON: tuples become lists, paths become strings; passwords of addresses are masked."""
+    """Return a value as plain JSON: tuples as lists, paths as strings, passwords in addresses masked."""
     if isinstance(value, (tuple, list)):
         return [plain(part) for part in value]
     return masked(str(value)) if isinstance(value, str | Path) else value
@@ -90,7 +90,7 @@ def plain(value: Any) -> Any:
 
 @functools.cache
 def attributes(config_class: type[Any]) -> Mapping[str, str]:
-    """Return the "Attributes:" entries of a class and its bases; ``a, b: text`` describes both."""
+    """Return the "Attributes:" entries of a class and its bases by name; ``a, b: text`` describes both names."""
     found: dict[str, str] = {}
     for kind in reversed(config_class.__mro__):
         part = inspect.cleandoc(kind.__dict__.get("__doc__") or "").partition("Attributes:\n")[2].split("\n\n")[0]

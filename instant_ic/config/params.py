@@ -1,9 +1,9 @@
-"""Turn ROS 2 YAML files and ``key:=value`` overrides into a node's typed, checked configuration.
+"""A node's typed, checked configuration from ROS 2 YAML files and ``key:=value`` overrides.
 
 File form::
 
     /**:
-      ros__parameters: {rate_hz: 20.0}           # every node that has such a parameter
+      ros__parameters: {rate_hz: 20.0}           # for every node that has this parameter
     grid_slam:
       ros__parameters:
         resolution: 0.05                         # metres
@@ -33,10 +33,10 @@ from instant_ic.util.safe_text import masked, masked_values
 ConfigT = TypeVar("ConfigT")
 
 _MOST_SHOWN = 80
-"""Characters of a refused value that its error shows."""
+"""Number of characters of a refused value that the error shows."""
 
 SHARED = "/**"
-"""Section of a parameter file for all nodes: each takes the values that it has a parameter for."""
+"""Section of a parameter file for all nodes. A node ignores values for which it has no parameter."""
 
 
 @dataclass(frozen=True)
@@ -44,8 +44,8 @@ class Problem:
     """One mistake in parameters.
 
     Attributes:
-        where: its place (``config/slam.yaml:12`` or ``-p key:=value``); empty if no given value is at fault.
-        key: the parameter at fault; empty if there is none.
+        where: place of the mistake (``config/slam.yaml:12`` or ``-p key:=value``); empty if no given value is at fault.
+        key: parameter at fault; empty if no single one is.
     """
 
     text: str
@@ -58,7 +58,7 @@ class Problem:
 
 
 class ParameterError(ValueError):
-    """Parameters are unknown, of the wrong type or out of range; ``problems`` holds each mistake with its place."""
+    """Parameters are unknown, of the wrong type or out of range; ``problems`` lists each mistake with its place."""
 
     def __init__(self, *problems: Problem | str) -> None:
         self.problems = tuple(Problem(p) if isinstance(p, str) else p for p in problems)
@@ -71,9 +71,9 @@ class Value:
 
     Attributes:
         given: value with the spelling of its scalars (``yaml_text.spelled``), or a plain value.
-        where: ``config/slam.yaml:12`` or ``-p key:=value``.
-        file: the parameter file; None: the command line.
-        shared: true if it comes from a ``/**`` section, which is for every node that has such a parameter.
+        where: place of the value, ``config/slam.yaml:12`` or ``-p key:=value``.
+        file: the parameter file; None for the command line.
+        shared: true if the value comes from a ``/**`` section, which nodes without this parameter ignore.
     """
 
     given: Any
@@ -83,7 +83,7 @@ class Value:
 
     @property
     def value(self) -> Any:
-        """Plain value, with the types that YAML 1.1 gives."""
+        """Plain value, with the type that YAML 1.1 gives it."""
         return resolved(self.given)
 
 
@@ -96,8 +96,8 @@ class ProcessParameters(Checked):
     """Parameters that every node has in addition to its own.
 
     Attributes:
-        use_sim_time: the clock follows ``/clock``; callbacks wait for its first value.
-        nice: a node with a higher value yields the CPU to the others when there is not enough for all.
+        use_sim_time: follow ``/clock``; callbacks wait for its first value.
+        nice: priority as of Unix ``nice``; a node with a higher value yields the CPU to others when it is short.
     """
 
     use_sim_time: bool = False
@@ -117,10 +117,10 @@ def gather(
         node: name of the node.
         files: parameter files.
         overrides: ``key:=value`` texts.
-        places: place of an override, if it has a better one than the command line (a launch file's line).
+        places: override to its place in a launch file; others are attributed to the command line.
 
     Raises:
-        ParameterError: all files and overrides that cannot be read.
+        ParameterError: files or overrides cannot be read; the error lists all of them.
     """
     values: Values = {}
     problems: list[Problem] = []
@@ -145,7 +145,7 @@ def configure(config_class: type[ConfigT], values: Mapping[str, Value]) -> tuple
     """Return the typed configuration of a node, and the parameters of its process.
 
     Raises:
-        ParameterError: all values that are refused.
+        ParameterError: values are refused; the error lists all of them.
     """
     own = {key: value for key, value in values.items() if key not in PROCESS_KEYS}
     common = {key: value for key, value in values.items() if key in PROCESS_KEYS}
@@ -162,7 +162,7 @@ def configure(config_class: type[ConfigT], values: Mapping[str, Value]) -> tuple
 
 
 def load_file(path: Path, node: str) -> Values:
-    """Read the parameters of one node from a ROS 2 parameter file; its own section overrides ``/**``.
+    """Read the parameters of one node from a ROS 2 parameter file. Its own section overrides ``/**``.
 
     Raises:
         ParameterError: the file cannot be read, is not YAML, or has the wrong structure.
@@ -172,7 +172,7 @@ def load_file(path: Path, node: str) -> Values:
 
 
 def load_sections(path: Path) -> dict[str, Values]:
-    """Read all sections of a ROS 2 parameter file: node name, or ``/**``, → its values.
+    """Read all sections of a ROS 2 parameter file, by node name or ``/**``.
 
     Raises:
         ParameterError: see :func:`load_file`.
@@ -204,11 +204,11 @@ def _one_line(error: BaseException) -> str:
 
 
 def yaml_value(text: str, what: str) -> Any:
-    """Parse a value typed by the user; its unquoted scalars keep their spelling.
+    """Parse a value typed by the user. Unquoted scalars keep their spelling.
 
     Args:
         text: YAML.
-        what: prefix of the error message.
+        what: place named in the error.
 
     Raises:
         ParameterError: the text is not YAML.
@@ -234,15 +234,16 @@ def parse_override(word: str) -> tuple[str, Value]:
 def build(config_class: type[ConfigT], values: Mapping[str, Value], base: ConfigT | None = None) -> ConfigT:
     """Return a typed configuration from flat values.
 
-    A shared value that the node does not have is for other nodes, and skipped.
+    A shared value without a parameter in this configuration is meant for other nodes and is skipped.
 
     Args:
         config_class: the configuration's class.
-        values: dotted key → value.
+        values: values by dotted key.
         base: source of all other values; None uses the defaults.
 
     Raises:
-        ParameterError: all unknown keys, wrong types and values out of range, and what ``__post_init__`` refused.
+        ParameterError: keys are unknown, or values have the wrong type, are out of range or are refused by
+            ``__post_init__``; the error lists all of them.
     """
     problems: list[Problem] = []
     typed: dict[str, Any] = {}
@@ -255,7 +256,7 @@ def build(config_class: type[ConfigT], values: Mapping[str, Value], base: Config
         except _RefusedError as error:
             problems.append(Problem(str(error), value.where, key))
     if problems and base is None and _required(config_class) - typed.keys():
-        raise ParameterError(*problems)  # it cannot be built without them
+        raise ParameterError(*problems)  # the configuration cannot be built without the refused values
     while True:
         try:
             config = _assemble(config_class, typed, base)
@@ -272,10 +273,10 @@ def build(config_class: type[ConfigT], values: Mapping[str, Value], base: Config
 
 
 def typed_value(config_class: type[Any], key: str, given: Any) -> Any:
-    """Return a parameter's value by its declared type and range.
+    """Return a given value as the declared type of its parameter, checked against the range.
 
     Raises:
-        ValueError: there is no such parameter, or the value does not fit it.
+        ValueError: there is no such parameter, or the value does not fit.
     """
     try:
         return _coerce(given, _type_of(config_class, key), key)
@@ -319,7 +320,7 @@ def _type_of(config_class: type[Any], key: str) -> Any:
 
 
 def _assemble(config_class: type[ConfigT], typed: Mapping[str, Any], base: ConfigT | None) -> ConfigT:
-    """Build a configuration from flat typed values; a ValueError comes from a dataclass's own check."""
+    """Build a configuration from flat typed values. A dataclass's own check may raise ValueError."""
     arguments: dict[str, Any] = {}
     groups: dict[str, dict[str, Any]] = {}
     for key, value in typed.items():
@@ -330,14 +331,14 @@ def _assemble(config_class: type[ConfigT], typed: Mapping[str, Any], base: Confi
             arguments[head] = value
     fields = {field.name: field for field in dataclasses.fields(config_class)}  # type: ignore[arg-type]
     for head, inner in groups.items():
-        # A group's defaults come from its parent: another group of the same class may have different ones.
+        # A group's defaults come from its parent, as two groups of one class may have different defaults.
         group = field_default(fields[head]) if base is None else getattr(base, head)
         arguments[head] = _assemble(_hints(config_class)[head], inner, group)  # type: ignore[arg-type]
     return config_class(**arguments) if base is None else dataclasses.replace(base, **arguments)  # type: ignore[type-var]
 
 
 def _culprit(config_class: type[Any], typed: Mapping[str, Any], base: Any, error: ValueError) -> str:
-    """Return the key of the first value without which the error disappears or changes; empty if there is none."""
+    """Return the key of the first value without which the error disappears or changes; empty if none is found."""
     for key in typed:
         try:
             _assemble(config_class, {other: value for other, value in typed.items() if other != key}, base)
@@ -403,7 +404,7 @@ def _coerce_sequence(value: list[Any], origin: Any, arguments: tuple[Any, ...], 
 
 
 def to_dict(config: Any) -> dict[str, Any]:
-    """Return a configuration as nested plain values; passwords of addresses are masked."""
+    """Return a configuration as nested plain values, with passwords in addresses masked."""
     masked_config: dict[str, Any] = masked_values(_plain_dict(config))
     return masked_config
 
@@ -415,16 +416,16 @@ def _plain_dict(config: Any) -> dict[str, Any]:
 def change(
     config: ConfigT, values: Mapping[str, Any], is_live: Callable[[str], bool], where: str
 ) -> tuple[ConfigT, dict[str, Any]]:
-    """Apply new values to a configuration and check it as a whole; returns it with what differs (flat).
+    """Apply new values to a configuration and check it as a whole. Return it and the changed values (flat).
 
     Args:
         config: the present configuration.
         values: flat or nested keys; unchanged values are allowed.
-        is_live: returns whether a key may be changed while the node runs.
+        is_live: function that returns whether a key may be changed while the node runs.
         where: prefix of the error messages.
 
     Raises:
-        ParameterError: a value is wrong, or its parameter takes effect only at the start.
+        ParameterError: a value is wrong, or its parameter cannot be changed while the node runs.
     """
     flat = {key: Value(value, where) for key, value in flatten(values).items()}
     changed = build(type(config), flat, config)

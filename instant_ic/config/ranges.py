@@ -25,7 +25,7 @@ from typing import Annotated, Any, TypeAlias, get_args, get_origin, get_type_hin
 
 @dataclass(frozen=True)
 class Range:
-    """Allowed range of a number, which must always be finite.
+    """Allowed range of a finite number.
 
     Attributes:
         low: smallest allowed value.
@@ -41,7 +41,7 @@ class Range:
 
     def __contains__(self, value: float) -> bool:
         return (
-            (isinstance(value, int) or math.isfinite(value))  # a huge int is not for isfinite()
+            (isinstance(value, int) or math.isfinite(value))  # isfinite() raises for a huge int
             and (self.low is None or value >= self.low)
             and (self.high is None or value <= self.high)
             and (self.above is None or value > self.above)
@@ -61,18 +61,18 @@ class Range:
         return f"must lie in {self}" if ".." in str(self) else f"must be {str(self).replace(', ', ' and ')}"
 
     def refusal(self, value: float, shown: object = None) -> str:
-        """Return the text of the error for a value outside: ``must lie in 0..19 (got 33)``.
+        """Return the error text for a value outside the range: ``must lie in 0..19 (got 33)``.
 
         Args:
             value: the value.
-            shown: the value in its spelling; None: as Python writes it.
+            shown: the value as it was spelled; None uses Python's notation.
         """
         return f"{self.words} (got {value if shown is None else shown})"
 
 
 @dataclass(frozen=True)
 class Plausible(Range):
-    """Values that make sense for a tracked robot; the error guesses a slipped decimal point or millimetres.
+    """Values that make sense for a tracked robot. The error suggests a value with the decimal point moved.
 
     >>> print(Plausible(0.05, 3).refusal(3.8))
     must lie in 0.05..3 (got 3.8); did you mean 0.38?
@@ -81,7 +81,7 @@ class Plausible(Range):
     def refusal(self, value: float, shown: object = None) -> str:
         text = super().refusal(value, shown)
         powers = (-1, -2, -3) if self.high is not None and value > self.high else (1, 2, 3)
-        # In decimals: 0.1 times 3.8 is not quite 0.38 in floating point.
+        # Decimal, because 0.1 times 3.8 is not exactly 0.38 in floating point.
         guesses = (float(Decimal(str(value)).scaleb(power)) for power in powers) if abs(value) < 1e15 else ()
         meant = next((guess for guess in guesses if guess in self), None)
         return text if meant is None else f"{text}; did you mean {meant:g}?"
@@ -96,7 +96,7 @@ Percent: TypeAlias = Annotated[int, Range(1, 100)]
 
 
 def range_of(hint: Any) -> Range | None:
-    """Return the range in a type's annotation, also inside ``X | None``; None if there is none."""
+    """Return the range in a type's annotation, even inside ``X | None``; None if it has none."""
     if get_origin(hint) is Annotated:
         return next((extra for extra in get_args(hint)[1:] if isinstance(extra, Range)), None)
     found = (range_of(part) for part in get_args(hint) if get_origin(hint) is not tuple)
@@ -105,7 +105,7 @@ def range_of(hint: Any) -> Range | None:
 
 @functools.cache
 def ranges(config_class: type[Any]) -> dict[str, Range]:
-    """Return field → range for a dataclass's own fields (not those of nested groups)."""
+    """Return the ranges of a dataclass's own fields, without nested groups, by field name."""
     hints = get_type_hints(config_class, include_extras=True)
     return {f.name: bounds for f in dataclasses.fields(config_class) if (bounds := _element(hints[f.name])) is not None}
 
@@ -127,7 +127,7 @@ def check_ranges(config: Any) -> None:
     """Check every field of a dataclass against its range; for ``__post_init__``.
 
     Raises:
-        ValueError: names the field, its range and the value.
+        ValueError: a value is out of range; the text names field, range and value.
     """
     for name, bounds in ranges(type(config)).items():  # type: ignore[arg-type]
         for value in _numbers(getattr(config, name)):
@@ -136,27 +136,25 @@ def check_ranges(config: Any) -> None:
 
 
 class Checked:
-    """Base of a configuration (a dataclass) that has no other rules than the ranges of its fields."""
+    """Base class of a configuration dataclass whose fields are checked against their ranges."""
 
     def __post_init__(self) -> None:
         check_ranges(self)
 
 
 def require_protection(unprotected: bool, off: Sequence[str], danger: str) -> None:
-    """Refuse protections that are off unless ``unprotected`` says that this is intended.
+    """Refuse parameters that switch a protection off, unless ``unprotected`` is set.
 
     Args:
         unprotected: true if the missing protection is intended.
         off: names of the parameters that switch a protection off.
-        danger: the consequence, for the error.
+        danger: consequence, for the error.
     """
     if off and not unprotected:
-        raise ValueError(
-            f"{', '.join(off)}: protection is off, so that {danger}: switch it on, or set unprotected: true"
-        )
+        raise ValueError(f"{', '.join(off)}: protection is off, so {danger}. Switch it on, or set unprotected: true")
 
 
 def require(config: Any, name: str, condition: bool, rule: str) -> None:
-    """Check a condition between fields; for ``__post_init__`` after :func:`check_ranges`."""
+    """Check a condition between fields, for ``__post_init__`` after :func:`check_ranges`."""
     if not condition:
         raise ValueError(f"{name} must be {rule} (got {getattr(config, name)!r})")

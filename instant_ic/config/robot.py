@@ -1,6 +1,6 @@
 """Parameters that several nodes share: the robot's outline, its limits and its sensor mounts.
 
-The ``/**`` section of `config/robot.yaml` has their values. Every node that uses one declares it by the same name.
+Their values are in the ``/**`` section of `config/robot.yaml`. Every node that uses one declares it by the same name.
 """
 
 from __future__ import annotations
@@ -13,9 +13,9 @@ from instant_ic.config.ranges import Checked, Plausible, Range, check_ranges
 from instant_ic.geometry.twists import clip_twist
 
 MOST_STOPPING_M = 3.0
-"""Longest stopping distance of a robot: low obstacles farther away are not seen."""
+"""Longest stopping distance of a robot, because low obstacles farther away are not seen."""
 MOST_STOPPING_RAD = math.pi
-"""Largest angle in which a robot that turns on the spot may stop."""
+"""Largest angle within which a robot that turns on the spot must stop."""
 Metres = Annotated[float, Plausible(-5, 5)]
 Degrees = Annotated[float, Range(-360, 360)]
 
@@ -25,8 +25,8 @@ class Rectangle(Checked):
     """The robot's outline, centred on base_link.
 
     Attributes:
-        length_m: m; along x.
-        width_m: m; along y.
+        length_m: m; extent along x.
+        width_m: m; extent along y.
     """
 
     length_m: Annotated[float, Plausible(0.1, 3)] = 0.60
@@ -40,8 +40,8 @@ class MotionLimits(Checked):
     Attributes:
         max_linear_m_s: m/s; largest speed.
         max_angular_rad_s: rad/s; largest turn rate.
-        max_linear_accel_m_s2: m/s²; largest change of the speed, for braking too: sets how far ahead the prediction
-            looks.
+        max_linear_accel_m_s2: m/s²; largest change of the speed, including braking. It determines how far ahead the
+            prediction looks.
         max_angular_accel_rad_s2: rad/s²; largest change of the turn rate.
     """
 
@@ -73,7 +73,7 @@ class MotionLimits(Checked):
 
 @dataclass(frozen=True)
 class Mount(Checked):
-    """Pose of a sensor on base_link, which is on the ground.
+    """Pose of a sensor in base_link, whose origin is on the ground.
 
     Attributes:
         xyz: m; position.

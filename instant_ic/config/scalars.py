@@ -1,9 +1,9 @@
-"""Scalars of YAML read by the type that they are for.
+"""Conversion of YAML scalars to the type of the parameter that they are for.
 
-YAML gives a type by the spelling alone: ``5e-06`` is text, ``0123`` is 83, ``1:30`` is 90, ``no`` is false, and
-``1_000``, dates and nulls have types too. A :class:`Scalar` keeps the spelling until the type is known. Each function
-here takes a Scalar, or a value that is typed already (quoted text, a value of JSON), and raises ValueError with what it
-must be.
+YAML derives the type from the spelling alone: ``5e-06`` is text, ``0123`` is 83, ``1:30`` is 90, ``no`` is false, and
+``1_000``, dates and nulls have types too. A :class:`Scalar` keeps the spelling until the wanted type is known. Each
+function here takes a Scalar or a typed value (quoted text, a value from JSON), and raises ValueError with the wanted
+type.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ _NUMBER_LIKE = re.compile(r"[-+.\d][\w.:+-]*", re.ASCII)
 
 @dataclass(frozen=True)
 class Scalar:
-    """An unquoted scalar without a tag, as it is spelled."""
+    """An unquoted scalar without a tag, in its spelling."""
 
     text: str
 
@@ -43,7 +43,7 @@ def is_null(value: Any) -> bool:
 
 
 def to_bool(value: Any) -> bool:
-    """Return a truth value: ``true``, ``yes``, ``on`` and their opposites, as in YAML 1.1 and ROS 2."""
+    """Return a boolean from ``true``, ``yes``, ``on`` or their opposites, as in YAML 1.1 and ROS 2."""
     found = _BOOLS.get(value.text.lower()) if isinstance(value, Scalar) else value
     if not isinstance(found, bool):
         raise ValueError("must be bool")
@@ -51,7 +51,7 @@ def to_bool(value: Any) -> bool:
 
 
 def to_whole_number(value: Any) -> int:
-    """Return a whole number of any size: ``1_000``, ``0x1F`` and ``0b11`` too, but nothing with a leading zero."""
+    """Return an integer of any size. ``1_000``, ``0x1F`` and ``0b11`` are accepted, but no leading zeros."""
     number = value
     if isinstance(value, Scalar):
         with suppress(ValueError):
@@ -64,7 +64,7 @@ def to_whole_number(value: Any) -> int:
 
 
 def to_int(value: Any) -> int:
-    """Return a whole number of at most 64 bits."""
+    """Return an integer of at most 64 bits."""
     number = to_whole_number(value)
     if not -(1 << 63) <= number < 1 << 63:
         raise ValueError("must have at most 64 bits, as in ROS 2")
@@ -72,11 +72,11 @@ def to_int(value: Any) -> int:
 
 
 def to_float(value: Any) -> float:
-    """Return a finite number in any spelling: ``5e-06``, ``.5``, ``1_000``, ``0123`` (123), ``0x10``."""
+    """Return a finite number from any spelling: ``5e-06``, ``.5``, ``1_000``, ``0123`` (123), ``0x10``."""
     number = _number(value.text) if isinstance(value, Scalar) else value
     if not isinstance(number, (int, float)) or isinstance(number, bool):
         raise ValueError("must be float")
-    with suppress(OverflowError):  # of a huge int
+    with suppress(OverflowError):  # raised for a huge int
         if math.isfinite(found := float(number)):
             return found
     raise ValueError("must be a finite number")
@@ -92,7 +92,7 @@ def _number(text: str) -> int | float | None:
 
 
 def to_text(value: Any) -> str:
-    """Return a text in its spelling, ``no`` and ``0123`` too. Nothing at all is refused: empty text is ``""``."""
+    """Return a text in its spelling, even ``no`` and ``0123``. Null is refused; empty text is ``""``."""
     if isinstance(value, Scalar) and value.text:
         return value.text
     if isinstance(value, (str, int, float)) and not isinstance(value, bool):
@@ -107,4 +107,4 @@ READERS: Mapping[type, Callable[[Any], Any]] = {
     str: to_text,
     Path: lambda value: Path(to_text(value)),
 }
-"""Type → its function."""
+"""Conversion function by type."""

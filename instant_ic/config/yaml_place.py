@@ -1,4 +1,4 @@
-"""YAML files whose values know their file and line."""
+"""YAML values with their file and line."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ _KINDS = {yaml.ScalarNode: "single value", yaml.SequenceNode: "list", yaml.Mappi
 
 
 class YamlProblem(ValueError):
-    """One mistake in a file; printed as ``file:line: text``, which editors and terminals understand."""
+    """One mistake in a file, printed as ``file:line: text``, which editors and terminals recognise."""
 
     def __init__(self, file: Path, line: int, text: str) -> None:
         super().__init__(f"{_shortened(file)}:{line}: {text}")
@@ -40,17 +40,17 @@ class YamlPlace:
 
     @property
     def is_single(self) -> bool:
-        """True if it is neither a list nor a mapping."""
+        """True for a value that is neither a list nor a mapping."""
         return isinstance(self.node, yaml.ScalarNode)
 
     @property
     def is_quoted(self) -> bool:
-        """True if it is quoted or block text, which is never a number or a boolean."""
+        """True for quoted or block text, which is never a number or a boolean."""
         return isinstance(self.node, yaml.ScalarNode) and bool(self.node.style)
 
     @property
     def is_mapping(self) -> bool:
-        """True if it has keys and values."""
+        """True for a mapping of keys to values."""
         return isinstance(self.node, yaml.MappingNode)
 
     @property
@@ -62,7 +62,7 @@ class YamlPlace:
         return YamlProblem(self.file, self.line, text)
 
     def text(self) -> str:
-        """Return the scalar as it is written; empty for null."""
+        """Return the scalar as it is written; empty text for null."""
         if not self.is_single:
             raise self._unexpected("a single value")
         return "" if self._is_null else str(self.node.value)
@@ -74,9 +74,9 @@ class YamlPlace:
         return [YamlPlace(self.file, entry) for entry in self.node.value]
 
     def fields(self, known: Collection[str] = (), required: Collection[str] = ()) -> dict[str, YamlPlace]:
-        """Return the entries of a mapping; null has none.
+        """Return the entries of a mapping; null counts as an empty mapping.
 
-        A missing, a repeated or, with ``known``, an unknown key is a mistake.
+        A missing or repeated key raises :class:`YamlProblem`. So does an unknown key, if ``known`` is given.
         """
         if not self.is_mapping and not self._is_null:
             raise self._unexpected("keys and values")
@@ -105,10 +105,10 @@ class YamlPlace:
 
 
 def load(file: Path) -> YamlPlace:
-    """Read a YAML file; an empty one is null.
+    """Read a YAML file. An empty file is null.
 
     Raises:
-        YamlProblem: it cannot be read, or is not YAML.
+        YamlProblem: the file cannot be read or is not YAML.
     """
     try:
         node = compose_yaml(file.read_text(encoding="utf-8"))

@@ -1,4 +1,4 @@
-"""YAML with one type of error, and limits on what aliases expand to."""
+"""YAML reader with a single type of error and a limit on expanded aliases."""
 
 from __future__ import annotations
 
@@ -10,19 +10,19 @@ import yaml
 from instant_ic.config.scalars import Scalar
 
 T = TypeVar("T")
-# Errors that PyYAML raises for a value that does not fit its type, such as `!!int "_"`.
+# Exceptions that PyYAML raises for a value that does not fit its tag, such as `!!int "_"`.
 _STRAY = (ValueError, TypeError, AttributeError, IndexError, KeyError, OverflowError)
 _MOST_LEVELS = 100
 _MOST_VALUES = 100_000
-"""Values of a document with each alias counted where it is used: 300 bytes of aliases can stand for billions."""
+"""Largest number of values in a document, counting each use of an alias: 300 bytes of aliases can mean billions."""
 _MOST_BITS = 10_000
-"""Most bits of a whole number. Python prints no number of 4300 digits, not even in the error that refuses it."""
+"""Largest size of an integer in bits. Python cannot print a number of 4300 digits, not even in an error."""
 _TEXT = yaml.resolver.BaseResolver.DEFAULT_SCALAR_TAG
 _TOO_DEEP = "lists or mappings are nested too deeply, or an anchor contains itself"
 
 
 class _Loader(yaml.SafeLoader):
-    """Refuses numbers that cannot be printed, such as a hexadecimal one of thousands of digits."""
+    """Loader that refuses integers too long to be printed."""
 
     def construct_yaml_int(self, node: Any) -> int:
         value = int(super().construct_yaml_int(node))
@@ -35,10 +35,10 @@ _Loader.add_constructor("tag:yaml.org,2002:int", _Loader.construct_yaml_int)
 
 
 class _SpelledLoader(_Loader):
-    """Keeps the spelling of unquoted scalars; keys of mappings are text."""
+    """Loader that keeps the spelling of unquoted scalars and reads keys of mappings as text."""
 
     def construct_object(self, node: Any, deep: bool = False) -> Any:
-        # Quotes make a text, except as `! '1:30'`, which PyYAML writes for a number with a colon.
+        # A quoted scalar is text, except in the form `! '1:30'`, which PyYAML writes for a number with a colon.
         plain = isinstance(node, yaml.ScalarNode) and (not node.style or node.tag != _TEXT)
         if plain and node.tag == _implicit_tag(node.value):
             return Scalar(node.value)
@@ -60,7 +60,7 @@ def read_yaml(text: str) -> Any:
     """Return the plain value of a YAML document.
 
     Raises:
-        yaml.YAMLError: the text is not YAML, a value does not fit its type, or see :func:`compose_yaml`.
+        yaml.YAMLError: see :func:`compose_yaml`; or a value does not fit its type.
     """
     root = compose_yaml(text)
     return None if root is None else construct(root)
@@ -77,16 +77,16 @@ def read_spelled(text: str) -> Any:
 
 
 def compose_yaml(text: str) -> yaml.Node | None:
-    """Return the nodes of a YAML text, with their lines; None if it is empty.
+    """Return the root node of a YAML text, with line numbers; None for an empty text.
 
-    The C parser, where there is one, takes a tenth of the time.
+    The C parser is used if it is available, because it takes a tenth of the time.
 
     Raises:
-        yaml.YAMLError: the text is not YAML, it is nested too deeply, or its aliases stand for too many values.
+        yaml.YAMLError: the text is not YAML, is nested too deeply, or its aliases expand to too many values.
     """
     loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
     level = 0
-    for event in yaml.parse(text, Loader=loader):  # no recursion, unlike compose(), which would overflow C's stack
+    for event in yaml.parse(text, Loader=loader):  # compose() is recursive and could overflow the C stack
         level += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
         if level > _MOST_LEVELS:
             raise _refused(_TOO_DEEP, event)
@@ -106,7 +106,7 @@ def construct(node: yaml.Node) -> Any:
 
 
 def spelled(node: yaml.Node) -> Any:
-    """Return a node's value: lists, mappings with text as keys, :class:`Scalar`, and plain values of quoted scalars.
+    """Return a node's value as lists, mappings with text keys, :class:`Scalar`, and plain values of quoted scalars.
 
     Raises:
         yaml.YAMLError: a value does not fit its tag.
@@ -122,10 +122,10 @@ def _constructed(node: yaml.Node, loader: _Loader) -> Any:
 
 
 def resolved(value: Any) -> Any:
-    """Return a spelled value with the types that YAML 1.1 gives its scalars.
+    """Return a spelled value with its scalars converted to the types of YAML 1.1.
 
     Raises:
-        yaml.YAMLError: a scalar does not fit its type, such as a date in month 13.
+        yaml.YAMLError: a scalar does not fit its type, for example a date in month 13.
     """
     if isinstance(value, Scalar):
         return construct(yaml.ScalarNode(_implicit_tag(value.text), value.text))
@@ -135,14 +135,14 @@ def resolved(value: Any) -> Any:
 
 
 class _Dumper(yaml.SafeDumper):
-    """Keeps the spelling of :class:`Scalar`."""
+    """Dumper that keeps the spelling of :class:`Scalar`."""
 
 
 _Dumper.add_representer(Scalar, lambda dumper, scalar: dumper.represent_scalar(_implicit_tag(scalar.text), scalar.text))
 
 
 def dump_yaml(value: object, **style: Any) -> str:
-    """Return YAML with keys in their order. Scalars keep their spelling."""
+    """Return YAML text. Keys keep their order and scalars their spelling."""
     return str(yaml.dump(value, Dumper=_Dumper, sort_keys=False, **style))
 
 
@@ -153,15 +153,15 @@ def one_line(value: object) -> str:
 
 
 def _measure(node: yaml.Node, depth: int, known: dict[int, tuple[int, int]]) -> tuple[int, int]:
-    """Return the number of values and levels of a node, each alias counted where it is used.
+    """Return the number of values and levels of a node, counting each use of an alias.
 
     Args:
         node: the node.
-        depth: level of the node.
-        known: results by ``id`` of the node.
+        depth: level of the node in the document.
+        known: results so far, by ``id`` of the node.
 
     Raises:
-        yaml.YAMLError: there are too many.
+        yaml.YAMLError: there are too many values or levels.
     """
     if isinstance(node, yaml.ScalarNode):
         return 1, 0
@@ -184,7 +184,7 @@ def _refused(problem: str, node: Any) -> yaml.MarkedYAMLError:
 
 
 def _checked(read: Callable[[], T]) -> T:
-    """Call a function of PyYAML; its other exceptions become ``yaml.YAMLError``."""
+    """Call a function of PyYAML and turn its stray exceptions into ``yaml.YAMLError``."""
     try:
         return read()
     except _STRAY as error:

@@ -1,4 +1,4 @@
-"""Typed messages: every ROS 2 (Jazzy) type and our own, by short name, with conversions to and from numpy.
+"""Typed messages: every ROS 2 Jazzy type and our own, by short name, with conversions to and from numpy.
 
 >>> from instant_ic.msg import LaserScan, scan_message, stamp_ns
 >>> scan = scan_message([1.0, 2.0], -0.1, 0.2, 0.1, 30.0, "velodyne", 1_500_000_000)

@@ -1,4 +1,4 @@
-"""Conversions between messages and arrays: the only module that knows the fields of the ROS types used here."""
+"""Conversions between messages and arrays."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def image_message(array: NDArray[Any], encoding: str, frame_id: str, stamp: int)
     """Return a sensor_msgs/Image from an array (H, W) or (H, W, C); a contiguous array is not copied.
 
     Raises:
-        MessageError: unknown encoding, or an array whose shape or dtype does not fit it.
+        MessageError: the encoding is unknown, or the array's shape or dtype does not fit it.
     """
     if encoding not in _IMAGE_DTYPES:
         raise MessageError(f"image encoding {encoding!r} is not one of {', '.join(_IMAGE_DTYPES)}")
@@ -87,10 +87,10 @@ def image_message(array: NDArray[Any], encoding: str, frame_id: str, stamp: int)
 
 
 def image_array(message: Any) -> NDArray[Any]:
-    """Return the array (H, W) or (H, W, C) from a sensor_msgs/Image; a read-only view unless rows are padded.
+    """Return the array (H, W) or (H, W, C) of a sensor_msgs/Image, as a read-only view unless rows are padded.
 
     Raises:
-        MessageError: unknown encoding, big-endian data, or too few bytes.
+        MessageError: the encoding is unknown, the data is big-endian, or bytes are missing.
     """
     if message.encoding not in _IMAGE_DTYPES:
         raise MessageError(f"image encoding {message.encoding!r} is not one of {', '.join(_IMAGE_DTYPES)}")
@@ -119,7 +119,7 @@ def compressed_image_message(
 
 
 def cloud_message(points: NDArray[Any], frame_id: str, stamp: int) -> Any:
-    """Return a sensor_msgs/PointCloud2 from a structured array (N,), whose layout becomes the message's; not copied."""
+    """Return a sensor_msgs/PointCloud2 with the layout and, uncopied, the data of a structured array (N,)."""
     if points.dtype.fields is None or points.ndim != 1:
         raise MessageError(f"a point cloud needs a structured array (N,), got {points.dtype} {points.shape}")
     field_type = message_type("PointField")
@@ -161,10 +161,10 @@ def _cloud_dtype(fields: tuple[tuple[str, int, int], ...], step: int) -> np.dtyp
 
 
 def cloud_array(message: Any) -> NDArray[Any]:
-    """Return the structured view (N,) of a PointCloud2, its rows concatenated.
+    """Return the points of a PointCloud2, of all rows, as a structured view (N,).
 
     Raises:
-        MessageError: big-endian data, unknown field type, or too few bytes.
+        MessageError: the data is big-endian, a field's type is unknown, or bytes are missing.
     """
     if message.is_bigendian:
         raise MessageError("big-endian point clouds are not supported")
@@ -202,7 +202,7 @@ def scan_message(
     intensities: ArrayLike | None = None,
     scan_time: float = 0.1,
 ) -> Any:
-    """Return a sensor_msgs/LaserScan; ranges in metres as in REP-117 (inf: no return)."""
+    """Return a sensor_msgs/LaserScan with ranges in metres; inf is no return (REP-117)."""
     values = np.asarray(ranges, np.float32)
     return message_type("LaserScan")(
         header=header(frame_id, stamp),
@@ -221,7 +221,7 @@ def scan_message(
 def grid_message(
     grid: NDArray[np.int8], resolution: float, origin_xy: Sequence[float], frame_id: str, stamp: int
 ) -> Any:
-    """Return a nav_msgs/OccupancyGrid; ``grid`` (H, W) int8, −1 unknown, 0..100; row 0 has the lowest y."""
+    """Return a nav_msgs/OccupancyGrid from ``grid`` (H, W) int8: −1 unknown, else 0..100; row 0 has the lowest y."""
     height, width = grid.shape
     origin = np.eye(4)
     origin[:2, 3] = origin_xy[:2]
@@ -266,7 +266,7 @@ def pose_message(matrix: Matrix) -> Any:
 
 
 def pose2_from_message(message: Any) -> NDArray[np.float64]:
-    """Return the planar pose (3,) of a pose message or Odometry; errors as `matrix_from_pose`."""
+    """Return the planar pose (3,) of a pose message or Odometry; see `matrix_from_pose` for errors."""
     return pose2_from_matrix(matrix_from_pose(message))
 
 
@@ -332,11 +332,11 @@ def twist_message(v: float = 0.0, w: float = 0.0) -> Any:
 
 
 HARD_STOP = "hard_stop"
-"""``frame_id`` of a command that the base executes at its hard deceleration; only a zero twist carries it."""
+"""``frame_id`` of a zero twist that the base executes at its hard deceleration."""
 
 
 def twist_stamped(v: float, w: float, stamp: int, frame_id: str = "base_link") -> Any:
-    """Return a TwistStamped of a planar robot; ``frame_id`` is ``HARD_STOP`` for a stop without the soft ramp."""
+    """Return a TwistStamped of a planar robot; ``frame_id`` ``HARD_STOP`` demands a stop without the soft ramp."""
     return message_type("TwistStamped")(header=header(frame_id, stamp), twist=twist_message(v, w))
 
 
@@ -348,7 +348,7 @@ def twist_values(message: Any) -> tuple[float, float]:
 
 
 def battery_message(voltage_v: float, charge: float, frame_id: str, stamp: int) -> Any:
-    """Return a sensor_msgs/BatteryState of a discharging battery with ``charge`` 0-1; what is not measured is NaN."""
+    """Return a sensor_msgs/BatteryState of a discharging battery, ``charge`` 0-1; unmeasured fields are NaN."""
     state, nan, none = message_type("BatteryState"), float("nan"), np.zeros(0, np.float32)
     return state(
         header=header(frame_id, stamp),
@@ -380,7 +380,7 @@ def odometry_message(
     pose_covariance: NDArray[np.float64] | None = None,
     twist_covariance: NDArray[np.float64] | None = None,
 ) -> Any:
-    """Return a nav_msgs/Odometry; covariances (6, 6) in the order x y z rx ry rz (REP-103), zero by default."""
+    """Return a nav_msgs/Odometry. Covariances are (6, 6) in the order x y z rx ry rz (REP-103), zero by default."""
     zero = np.zeros((6, 6))
     pose_cov = zero if pose_covariance is None else pose_covariance
     twist_cov = zero if twist_covariance is None else twist_covariance

@@ -12,12 +12,12 @@ from instant_ic.msg.types import DEFINITIONS, message_type, type_name, typestore
 _ROS_FIELDS = DEFINITIONS.parent / "ros_fields.yaml"
 _FIELD = re.compile(r"(?P<type>[A-Za-z][\w/]*)\S*\s+(?P<name>[a-z]\w*)\s*(#.*)?")
 _COLUMN = 40
-"""Column of the comments."""
+"""Column at which comments start."""
 
 
 @functools.cache
 def ros_fields() -> dict[str, dict[str, str]]:
-    """Return the comments on the ROS 2 types that this stack uses: type → field → unit, frame or meaning."""
+    """Return unit, frame or meaning of the fields of the ROS 2 types used here, by type and field."""
     comments: dict[str, dict[str, str]] = yaml.safe_load(_ROS_FIELDS.read_text(encoding="utf-8"))
     return comments
 
@@ -28,10 +28,10 @@ def own_types() -> list[str]:
 
 
 def definition(name: str) -> str:
-    """Return the definition of a type, by full or short name, with its comments, without nested types.
+    """Return the definition of a type, given by full or short name, with comments but without nested types.
 
     Raises:
-        MessageError: no such type.
+        MessageError: there is no such type.
     """
     full = type_name(message_type(name))
     package, _, short = full.split("/")
@@ -49,15 +49,15 @@ def definition(name: str) -> str:
 
 
 def expanded_definition(name: str) -> str:
-    """Return the definition of a type; the fields of nested types follow each field, indented, without comments.
+    """Return the definition of a type, with the fields of nested types indented below each field, without comments.
 
     Raises:
-        MessageError: no such type.
+        MessageError: there is no such type.
     """
     lines: list[str] = []
     nested = ""
     for line in definition(name).splitlines():
-        # Indented comments continue the comment of the field above: the nested fields follow them.
+        # Indented lines continue the comment of the field above, so nested fields are inserted after them.
         if not line[:1].isspace():
             lines += _nested(nested)
             field = _FIELD.fullmatch(line)

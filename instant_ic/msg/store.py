@@ -1,7 +1,7 @@
-"""The types that a process uses: classes and CDR code are made at their first use, from a cache of all definitions.
+"""Message types of a process. Classes and CDR code are generated at first use, from a cache of all definitions.
 
-`rosbags` makes several hundred classes at its import, and twelve functions for each type used. A node needs a few
-dozen classes and two or three functions each, so this saves a third of the CPU of its start.
+`rosbags` generates several hundred classes at its import, and twelve functions for each type used. A node needs a few
+dozen classes with two or three functions each, so generating them on demand saves a third of the CPU of its start.
 """
 
 from __future__ import annotations
@@ -22,21 +22,21 @@ if TYPE_CHECKING:
     from rosbags.typesys.store import Typestore
 
 Entry = Mapping[str, Any]
-"""Definition of a type: ``constants`` (name → value), ``fields`` (name, description of rosbags), ``hints`` (of the
-fields, as text), ``hash`` (RIHS01)."""
+"""Definition of a type: ``constants`` (values by name), ``fields`` (name and rosbags' description), ``hints`` (type
+hints of the fields as text), ``hash`` (RIHS01)."""
 
 
 class Definition:
-    """Class and CDR code of a type, as rosbags' generated code asks for them."""
+    """Class and CDR code of a type, with the interface that rosbags' generated code expects."""
 
     def __init__(self, name: str, entry: Entry, store: TypeIndex) -> None:
         self.fields: list[tuple[str, Any]] = entry["fields"]
         self._name, self._entry = name, entry
-        self._store: Any = store  # has what the generated code asks of rosbags' Typestore
+        self._store: Any = store  # replaces rosbags' Typestore for the generated code
 
     @functools.cached_property
     def cls(self) -> Any:
-        """The dataclass."""
+        """The dataclass of the type."""
         names = [name for name, _ in self.fields]
         body = {
             "__doc__": f"Class for {self._name}.",
@@ -63,7 +63,7 @@ class Definition:
 
     @property
     def size_cdr(self) -> int:
-        """Size of every message; 0 if it varies."""
+        """Size of a message in bytes; 0 if it varies."""
         return self._size[1]
 
     @functools.cached_property
@@ -88,18 +88,18 @@ class Definition:
         return generate_deserialize_cdr(self.fields, self._store, "be")
 
     def deserialize(self, data: bytes | memoryview) -> Any:
-        """Return the message in CDR bytes; raises what generated code raises on wrong bytes."""
+        """Return the message in CDR bytes. On wrong bytes, the generated code may raise any exception."""
         if len(data) < 4 or data[0] or data[1] > 1:
             raise ValueError("no header of plain CDR")
         read = self.deserialize_cdr_le if data[1] else self.deserialize_cdr_be
         message, end = read(data[4:], 0, self.cls, self._store)
-        if end + 4 + 3 < len(data):  # CDR may pad by up to 3 bytes
+        if end + 4 + 3 < len(data):  # CDR may be padded by up to 3 bytes
             raise ValueError(f"{len(data) - end - 4} bytes are left over")
         return message
 
 
 class TypeIndex:
-    """Definitions by full name."""
+    """Definitions of types by full name."""
 
     max_sequence_length = 2**32 - 1
 
@@ -111,7 +111,7 @@ class TypeIndex:
         """Return the definition of a type.
 
         Raises:
-            KeyError: no such type.
+            KeyError: there is no such type.
         """
         found = self._definitions.get(name)
         if found is None:
@@ -123,8 +123,8 @@ def entries_of(store: Typestore, names: set[str] | None = None) -> dict[str, Ent
     """Return the definitions of a store's types.
 
     Args:
-        store: with all nested types.
-        names: the wanted ones; None: all.
+        store: store that also has all nested types.
+        names: full names of the wanted types; None for all.
     """
     from rosbags.typesys.base import normalize_fieldname
     from rosbags.typesys.codegen import get_typehint
@@ -142,11 +142,11 @@ def entries_of(store: Typestore, names: set[str] | None = None) -> dict[str, Ent
 
 
 def read_entries(definitions: Path, make: Callable[[], Typestore]) -> dict[str, Entry]:
-    """Return all definitions, from the cache if it belongs to this rosbags and these files.
+    """Return all definitions, from the cache if it matches this version of rosbags and these files.
 
     Args:
         definitions: folder of our own ``.msg`` files.
-        make: creates the store to read them from otherwise. An unusable cache costs only time.
+        make: function that creates the store if the cache cannot be used.
     """
     key, file = _key(definitions), paths.cache_dir() / "message_types.json"
     with suppress(OSError, ValueError):
@@ -163,7 +163,7 @@ def read_entries(definitions: Path, make: Callable[[], Typestore]) -> dict[str, 
 
 
 def _key(definitions: Path) -> str:
-    """Return a hash of everything that the definitions depend on."""
+    """Return the cache's key: a hash of everything on which the definitions depend."""
     import rosbags
 
     digest = hashlib.sha256(Path(__file__).read_bytes())

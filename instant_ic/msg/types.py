@@ -1,4 +1,4 @@
-"""Message types: ROS 2 Jazzy's from `rosbags`, and our own from the ``.msg`` files beside this module."""
+"""Message types of ROS 2 Jazzy, from `rosbags`, and our own, from the ``.msg`` files beside this module."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ if TYPE_CHECKING:
 
 DEFINITIONS = Path(__file__).resolve().parent / "definitions"
 
-_LARGE = 1 << 16  # below this size, clearing the whole message is faster than finding out which parts need it
+_LARGE = 1 << 16  # below this size, clearing the whole message is faster than finding the parts that need it
 
-# Short names that several packages of Jazzy share, with the type that this stack means.
+# Short names that several packages of Jazzy share, with the type that they mean in this stack.
 _PREFERRED = {
     "GoalStatus": "action_msgs/msg/GoalStatus",
     "GoalStatusArray": "action_msgs/msg/GoalStatusArray",
@@ -27,14 +27,14 @@ _PREFERRED = {
 
 
 class MessageError(ValueError):
-    """The type is unknown, or the bytes are not a message of the given type."""
+    """The type is unknown, or the bytes or values are not a message of the type."""
 
 
 @functools.cache
 def typestore() -> Typestore:
-    """Return the store of rosbags with Jazzy's types and our own, for tools; created once per process (about 0.1 s).
+    """Return rosbags' store with Jazzy's types and our own, for tools. Its creation takes 0.1 s, once per process.
 
-    Its classes are not those of :func:`message_type`.
+    Its classes differ from those of :func:`message_type`.
     """
     from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
@@ -52,16 +52,16 @@ def _index() -> TypeIndex:
 
 
 def register_type(name: str, definition: str) -> None:
-    """Register another project's type in this process, from a definition as bags carry it.
+    """Register a type of another project in this process, from the definition in a bag.
 
-    Types that are already known, nested ones included, stay unchanged.
+    Types that are already known, including nested ones, stay unchanged.
 
     Args:
         name: full name, for example ``rover_msgs/msg/Cells``.
         definition: text in the ``ros2msg`` format, with the definitions of nested types.
 
     Raises:
-        MessageError: the text is not a definition.
+        MessageError: the text is not a valid definition.
     """
     if name in _index().entries:
         return
@@ -82,7 +82,7 @@ def message_type(name: str) -> Any:
     """Return the class of a type by full (``sensor_msgs/msg/Image``, ``sensor_msgs/Image``) or short name (``Image``).
 
     Raises:
-        MessageError: no such type.
+        MessageError: there is no such type.
     """
     types = _index().entries
     parts = name.split("/")
@@ -128,10 +128,10 @@ def serialize(message: Any) -> memoryview:
 def serializer(message: Any) -> tuple[int, Callable[[memoryview], None]]:
     """Return the size of a message's CDR bytes, and a function that writes them into memory of that size.
 
-    This allows a large message to be written once, straight into shared memory. Previous contents do not matter.
+    A large message can thus be written straight into shared memory. The memory need not be cleared before.
 
     Raises:
-        MessageError: a field has a value of the wrong type or length; the function raises it too.
+        MessageError: a field has a value of the wrong type or length. The returned function raises this too.
     """
     name = type_name(message)
     store = _index()
@@ -142,8 +142,8 @@ def serializer(message: Any) -> tuple[int, Callable[[memoryview], None]]:
         raise _explained(message, error) from error
 
     def write(target: memoryview) -> None:
-        # Padding must be zero, or equal messages would differ in their bytes. Padding is never inside an array:
-        # everything except the largest array is `rest` bytes, before or after it.
+        # Padding must be zero, or equal messages would differ in their bytes. Arrays have no padding inside, so only
+        # the `rest` bytes before and after the largest array are cleared.
         rest = size
         if size >= _LARGE:
             rest -= max((v.nbytes for v in vars(message).values() if isinstance(v, np.ndarray)), default=0)
@@ -165,10 +165,10 @@ def _explained(message: Any, error: Exception) -> MessageError:
 
 
 def deserialize(data: bytes | bytearray | memoryview, name: str) -> Any:
-    """Deserialize CDR bytes; large arrays are read-only views of ``data``.
+    """Deserialize CDR bytes. Large arrays are read-only views of ``data``.
 
     Raises:
-        MessageError: unknown type, or the bytes are truncated or of another type.
+        MessageError: the type is unknown, or the bytes are truncated or of another type.
     """
     definition = _definition(name)
     try:
@@ -184,7 +184,7 @@ def _definition(name: str) -> Definition:
 
 
 def _first_bad_field(message: Any) -> str | None:
-    """Describe the field that cannot be serialized, for the error message."""
+    """Describe the first field that cannot be serialized, for the error message."""
     for field in _index().get_msgdef(type_name(message)).fields:
         value = getattr(message, field[0], None)
         if value is None:

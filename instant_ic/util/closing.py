@@ -1,4 +1,4 @@
-"""Things that end with a ``with`` block: objects to close, signal handlers."""
+"""Context managers: objects that close at the end of a block, and signal handlers."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import Any, Self
 
 
 class Closing(ABC):
-    """Closed at the end of a ``with`` block, also after an error."""
+    """Base class of objects that close at the end of a ``with`` block, even after an error."""
 
     @abstractmethod
     def close(self) -> None: ...
@@ -27,8 +27,8 @@ class Closing(ABC):
 def on_end_signal(handler: Callable[..., Any]) -> Iterator[None]:
     """Handle SIGINT, SIGTERM and SIGHUP inside the block.
 
-    A script's ``COMMAND &`` inherits SIGINT as ignored; it is handled all the same. A SIGHUP that ``nohup`` ignores
-    stays ignored. Outside the main thread, where Python has no handlers, nothing is done.
+    A command started with ``&`` in a script inherits SIGINT as ignored, but SIGINT is handled here anyway. A SIGHUP
+    that ``nohup`` ignores stays ignored. Outside the main thread, where Python has no handlers, nothing is done.
     """
     if threading.current_thread() is not threading.main_thread():
         yield

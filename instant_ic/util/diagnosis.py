@@ -1,4 +1,4 @@
-"""State of a device or an algorithm, as its node publishes it in diagnostics."""
+"""State of a device or an algorithm, for a node's diagnostics."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ class Diagnosis:
     """One named state.
 
     Attributes:
-        name: the same name replaces the previous diagnosis.
+        name: name of the diagnosis; it replaces the previous one of this name.
         level: severity.
         text: what happened, then what to do.
-        values: figures beside the text.
+        values: further values to publish.
     """
 
     name: str
@@ -35,10 +35,10 @@ class Diagnosis:
 
 
 class RecentCount:
-    """Counts the events of the last ``window_s`` seconds; the caller supplies the time.
+    """Counts the events of the last ``window_s`` seconds. The caller supplies the time.
 
-    ``total`` is the newest argument of :meth:`rise`. A total since the start is no diagnosis: what counts is whether it
-    still grows.
+    ``total`` is the newest argument of :meth:`rise`. Diagnoses use the recent count, because a total since the start
+    does not show whether the fault persists.
     """
 
     def __init__(self, window_s: float) -> None:
@@ -47,12 +47,12 @@ class RecentCount:
         self.total = 0
 
     def add(self, events: int, now_ns: int) -> None:
-        """Add events at ``now_ns``; zero adds none."""
+        """Add a number of events at ``now_ns``."""
         if events > 0:
             self._events.append((now_ns, events))
 
     def rise(self, total: int, now_ns: int) -> int:
-        """Add what a running total has grown by since the last call; return the number of events in the window."""
+        """Add the growth of a running total since the last call. Return the number of events in the window."""
         self.add(total - self.total, now_ns)
         self.total = total
         return self.count(now_ns)

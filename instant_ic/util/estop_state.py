@@ -1,12 +1,12 @@
-"""Emergency-stop state that survives a restart: an emergency stop that nobody released, a run that was interrupted.
+"""Emergency-stop state that survives a restart: a latched emergency stop, and the mark of an interrupted run.
 
 Two files in a folder of each run directory (:func:`state_dir`):
 
 - ``estop.json``: the emergency stop is latched. The arbiter writes it on a press and removes it on a release.
 - ``run.json``: a stack is running. The launcher writes it at the start and removes it when every node has ended. If
-  it exists at the next start, that run was interrupted (power cut, killed launcher), and the stack starts stopped.
+  it exists at the next start, the last run was interrupted (power cut, killed launcher), and the stack starts stopped.
 
-Both are replaced atomically and synced to disk before the caller continues, mode 0600.
+Both have mode 0600, are replaced atomically, and are synced to disk before the caller continues.
 """
 
 from __future__ import annotations
@@ -26,17 +26,17 @@ RELEASE = "Release the emergency stop to continue."
 
 
 class EstopStateError(RuntimeError):
-    """The emergency stop's state cannot be saved; the message says where and what to do."""
+    """The emergency stop's state cannot be saved. The message names the file and the remedy."""
 
 
 @dataclass(frozen=True)
 class KeptStop:
-    """An emergency stop that nobody released.
+    """A latched emergency stop.
 
     Attributes:
         publisher: node that pressed it; ``launch`` after an interrupted run.
-        pressed_ns: publication time of the press, nanoseconds since the epoch; older releases do not count.
-        why: text for the operator; empty for a plain press.
+        pressed_ns: publication time of the press, nanoseconds since the epoch; releases before it do not count.
+        why: reason for the operator; empty for a plain press.
     """
 
     publisher: str
@@ -45,9 +45,10 @@ class KeptStop:
 
 
 def state_dir(run_dir: Path) -> Path:
-    """Return the folder of the state files: the run directory, unless a power cut or sign-out empties it.
+    """Return the folder of the state files: the run directory, unless that is the default one.
 
-    They empty the default one, whose folder lies below ``XDG_STATE_HOME/instant_ic`` (``~/.local/state/instant_ic``).
+    The default run directory is lost at a power cut or sign-out. Its state files are therefore in a folder below
+    ``XDG_STATE_HOME/instant_ic`` (``~/.local/state/instant_ic``).
     """
     default = paths.default_run_dir()
     if run_dir == default or default in run_dir.parents:
@@ -57,7 +58,7 @@ def state_dir(run_dir: Path) -> Path:
 
 
 def read(run_dir: Path) -> KeptStop | None:
-    """Return the emergency stop that nobody released, or None. An unreadable file counts as an emergency stop."""
+    """Return the latched emergency stop, or None. An unreadable file counts as an emergency stop."""
     file = state_dir(run_dir) / "estop.json"
     try:
         fields = json.loads(file.read_text(encoding="utf-8"))
@@ -70,7 +71,7 @@ def read(run_dir: Path) -> KeptStop | None:
 
 
 def write(run_dir: Path, stop: KeptStop | None) -> None:
-    """Save a press, or clear it (None).
+    """Save a press, or clear it if ``stop`` is None.
 
     Raises:
         EstopStateError: the folder cannot be written.
@@ -79,7 +80,7 @@ def write(run_dir: Path, stop: KeptStop | None) -> None:
 
 
 class RunMark:
-    """File in the state folder that exists while a stack runs; one left by an earlier run stops the next stack.
+    """File in the state folder that exists while a stack runs. If a run leaves it behind, the next one starts stopped.
 
     Args:
         run_dir: prepared run directory, locked against other stacks.
@@ -105,12 +106,12 @@ class RunMark:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Mark the run as ended cleanly, for whatever reason every node has ended."""
+        """Mark the run as ended cleanly. Every node has ended, so the reason does not matter."""
         _put(self._file, None)
 
 
 def _put(file: Path, content: dict[str, object] | None) -> None:
-    """Replace a file atomically, or remove it; the change is on disk when this returns."""
+    """Replace a file atomically, or remove it for None. The change is on disk when this returns."""
     try:
         if content is None:
             file.unlink(missing_ok=True)
@@ -121,7 +122,7 @@ def _put(file: Path, content: dict[str, object] | None) -> None:
                 stream.write(json.dumps(content).encode())
     except OSError as error:
         if content is None and isinstance(error, FileNotFoundError):
-            return  # without the folder there is no file either
+            return  # without the folder, there is no file to remove
         raise EstopStateError(
             f"the emergency stop's state cannot be kept: {file}: {error.strerror}. Free the disk, or set "
             "INSTANT_IC_RUN_DIR to a folder that can be written"

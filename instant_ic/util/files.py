@@ -13,14 +13,15 @@ from instant_ic.util.private import open_file, sync_folder
 
 @contextmanager
 def replacing(path: Path, private: bool = False, sync: bool = False) -> Iterator[BinaryIO]:
-    """Open a stream whose content replaces a file at the end of the block: readers see the old file or the new one.
+    """Open a stream whose content replaces a file at the end of the block.
 
-    The content is written to a file beside it. If the block raises, the old file stays.
+    The content is written to a temporary file beside it, so readers see either the old file or the new one. If the
+    block raises, the old file is kept.
 
     Args:
-        path: file to create or replace; its folder exists.
-        private: only its owner may read the file (mode 0600).
-        sync: write file and folder to the disk first, so that a power failure leaves the old file or the new one.
+        path: file to create or replace, in an existing folder.
+        private: let only the owner read the file (mode 0600).
+        sync: sync file and folder to the disk, so that a power failure leaves either the old file or the new one.
 
     Raises:
         OSError: the file cannot be written.

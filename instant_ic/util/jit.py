@@ -4,10 +4,10 @@ from __future__ import annotations
 
 
 def leave_out_blas() -> None:
-    """Keep numba from loading scipy's linear algebra, a third of the CPU of a process's first kernel call.
+    """Keep numba from loading scipy's linear algebra, which takes a third of the CPU of a process's first kernel call.
 
-    numba loads it with its array functions, whether or not a kernel multiplies matrices. None of ours does; one that
-    did would fail to compile with numba's text. Call it before the first kernel runs.
+    numba loads it with its array functions even if no kernel multiplies matrices. Our kernels do not. A kernel that
+    did would fail to compile. Call this before the first kernel runs.
     """
     from numba.np import linalg
 

@@ -1,4 +1,4 @@
-"""Checks and size of a JPEG without decoding it (ITU-T T.81, annex B)."""
+"""Completeness and size of a JPEG, found without decoding it (ITU-T T.81, annex B)."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ _WITHOUT_LENGTH = frozenset((0x01, *range(0xD0, 0xD8)))
 
 
 class JpegError(ValueError):
-    """Bytes that are not a complete JPEG; the text says what is wrong."""
+    """The bytes are not a complete JPEG."""
 
 
 def check_whole(data: bytes | bytearray) -> None:

@@ -1,4 +1,4 @@
-"""Limits for decoding files and messages: a few kilobytes can declare an image or an array of gigabytes."""
+"""Limits for decoding files and messages, because a few kilobytes can declare an image or an array of gigabytes."""
 
 from __future__ import annotations
 
@@ -14,25 +14,25 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 MOST_PIXELS = 32 << 20
-"""Limit for images from a network or a bag. The Theta's largest photo (6720x3360) has 22.6 million pixels."""
+"""Most pixels of an image from a network or a bag. The Theta's largest photo (6720x3360) has 22.6 million."""
 MOST_FILE_PIXELS = 160 << 20
-"""Limit for image files that an operator names: panoramas of 16384x8192."""
+"""Most pixels of an image file that an operator names; panoramas of 16384x8192 fit."""
 MOST_ARRAY_BYTES = 4 << 30
-"""Limit for all arrays of an ``.npz`` file together, decompressed."""
+"""Most bytes of all arrays of an ``.npz`` file together, decompressed."""
 
 _MOST_CHUNKS = 20_000
 _PNG = b"\x89PNG\r\n\x1a\n"
 
 
 def limit_opencv() -> None:
-    """Make OpenCV refuse images of larger declared size; OpenCV reads this setting once, before its first image."""
+    """Make OpenCV refuse images of larger declared size. OpenCV reads this setting once, before its first image."""
     os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(MOST_FILE_PIXELS))
 
 
 def decode_image(data: bytes | bytearray | NDArray[np.uint8], flags: int) -> NDArray[Any] | None:
-    """Decode a JPEG or PNG from an untrusted source, up to `MOST_PIXELS`; None if that fails.
+    """Decode a JPEG or PNG of at most `MOST_PIXELS` from an untrusted source; return None if that fails.
 
-    ``flags`` as for ``cv2.imdecode``.
+    ``flags`` are those of ``cv2.imdecode``.
     """
     import cv2
     import numpy as np
@@ -58,10 +58,10 @@ def decode_image(data: bytes | bytearray | NDArray[np.uint8], flags: int) -> NDA
 def decode_rgb(
     data: bytes | bytearray | NDArray[np.uint8], width: int = MOST_PIXELS, height: int = MOST_PIXELS
 ) -> NDArray[np.uint8]:
-    """Decode to (H, W, 3) uint8 RGB of at least ``width`` x ``height``, or of the full size if that is less.
+    """Decode to (H, W, 3) uint8 RGB of at least ``width`` x ``height``, or of the image's own size if it is smaller.
 
-    The decoder reduces the image 2, 4 or 8 times where the result is still large enough, and then computes
-    correspondingly less of the inverse cosine transform. The reduced size is rounded up.
+    The decoder shrinks the image 2, 4 or 8 times if the result is still large enough, which saves most of the inverse
+    cosine transform. The reduced size is rounded up.
 
     Raises:
         JpegError: the data cannot be decoded.
@@ -72,7 +72,7 @@ def decode_rgb(
     flag = cv2.IMREAD_COLOR
     try:
         full_width, full_height = jpeg_size(bytes(data[:65536]))
-    except JpegError:  # may be a PNG
+    except JpegError:  # the image may be a PNG
         full_width, full_height = 0, 0
     for n, reduced in (
         (2, cv2.IMREAD_REDUCED_COLOR_2),
@@ -88,9 +88,9 @@ def decode_rgb(
 
 
 def load_image(path: str | Path, flags: int) -> NDArray[Any] | None:
-    """Read an image file in any format that OpenCV supports, up to `MOST_FILE_PIXELS`; None if that fails.
+    """Read an image file of at most `MOST_FILE_PIXELS` in any format of OpenCV; return None if that fails.
 
-    ``flags`` as for ``cv2.imread``.
+    ``flags`` are those of ``cv2.imread``.
     """
     import cv2
 
@@ -107,7 +107,7 @@ def load_image(path: str | Path, flags: int) -> NDArray[Any] | None:
 
 
 def _chunks_fit(data: bytes | bytearray) -> bool:
-    """Return whether a PNG contains its chunks in full: OpenCV allocates the declared size, up to 1 GB for 40 bytes."""
+    """Return whether a PNG contains its chunks in full. OpenCV allocates the declared size, 1 GB for 40 bytes."""
     view, at = memoryview(data), len(_PNG)
     for _ in range(_MOST_CHUNKS):
         kind = bytes(view[at + 4 : at + 8])
@@ -123,8 +123,8 @@ def check_arrays(path: str | Path) -> None:
     """Check that an ``.npz`` file does not unpack to more than `MOST_ARRAY_BYTES`.
 
     Raises:
-        ValueError: it does, or it is damaged.
-        OSError: it cannot be read.
+        ValueError: the file unpacks to more, or is damaged.
+        OSError: the file cannot be read.
     """
     try:
         with zipfile.ZipFile(path) as archive:

@@ -1,11 +1,11 @@
-"""Pace of a simulated stack's time relative to the machine's: slow motion for a machine that is too slow or busy.
+"""Pace of a simulated stack's time relative to the machine's: slow motion on a machine that is too slow or busy.
 
-All processes of a stack share one pace. The launcher writes it into a file of the run directory, and each process maps
-that file. Stamps, timers and time-outs of the nodes follow the pace, and so do the simulated devices. Functions that
-concern only the machine (heartbeats, shutdown of processes) do not.
+All processes of a stack share one pace. The launcher writes it into a file of the run directory, which each process
+maps. The nodes' stamps, timers and time-outs follow the pace, and so do the simulated devices. Heartbeats and the
+shutdown of processes concern only the machine and do not.
 
 The launcher may change the pace while the stack runs. It writes each change ``LEAD_S`` ahead, so that all processes
-change at the same instant: the stack's time has no jump, and is the same in all of them.
+change at the same instant. The stack's time therefore does not jump and is the same in all processes.
 """
 
 from __future__ import annotations
@@ -25,12 +25,12 @@ from instant_ic.util.files import replacing
 FILE = "pace"
 SLOWEST, FASTEST = 0.02, 10.0
 SLOWEST_CHOSEN = 0.1
-"""Slowest pace to which the launcher adapts."""
+"""Slowest pace that the launcher chooses by itself."""
 LEAD_S = 0.2
 """Machine seconds from the writing of a change until it takes effect. Waits shorter than this are exact."""
 
-# Words of eight bytes: number of the record, whether the pace adapts, two stretches, and a CRC of all before it. The
-# CRC makes a record that is being written recognisable, whatever the order in which its words arrive.
+# Fields of eight bytes: number of the record, whether the pace adapts, two stretches, and a CRC of these fields. The
+# CRC reveals a record that is being written, in whatever order its fields arrive.
 _RECORD = struct.Struct("=QQdqqqdqqqQ")
 
 
@@ -40,13 +40,13 @@ class PaceError(ValueError):
 
 @dataclass(frozen=True, slots=True)
 class Stretch:
-    """A stretch of the stack's time with one factor.
+    """A stretch of the stack's time with a constant factor.
 
     Attributes:
         factor: seconds of the stack per second of the machine.
-        monotonic_ns: the machine's steady clock at its begin; all processes of a machine share it.
-        epoch_ns: the stack's nanoseconds since the epoch at its begin.
-        steady_ns: the stack's steady clock at its begin.
+        monotonic_ns: start on the machine's steady clock, which all its processes share.
+        epoch_ns: start in the stack's time, nanoseconds since the epoch.
+        steady_ns: start on the stack's steady clock.
     """
 
     factor: float
@@ -55,23 +55,23 @@ class Stretch:
     steady_ns: int
 
     def since_begin_ns(self, monotonic_ns: int) -> int:
-        """Return the stack's nanoseconds from the begin until an instant of the machine's steady clock."""
+        """Return the stack's nanoseconds from the start to an instant of the machine's steady clock."""
         return round(self.factor * (monotonic_ns - self.monotonic_ns))
 
     def followed_by(self, factor: float, monotonic_ns: int) -> Stretch:
-        """Return the stretch with another factor that begins where this one is at an instant."""
+        """Return the stretch with another factor that continues this one from an instant."""
         ns = self.since_begin_ns(monotonic_ns)
         return Stretch(factor, monotonic_ns, self.epoch_ns + ns, self.steady_ns + ns)
 
 
 class Pace:
-    """The stack's time: the machine's own, or that of the newest two stretches.
+    """The stack's time: the machine's own time, or that of the newest two stretches.
 
     Args:
-        stretch: a pace that does not change; None: the machine's own time.
+        stretch: stretch of a pace that does not change; None for the machine's own time.
 
     Attributes:
-        adapts: whether the launcher chooses the pace by what the machine can do.
+        adapts: whether the launcher adapts the pace to the machine's speed.
     """
 
     def __init__(self, stretch: Stretch | None = None) -> None:
@@ -79,7 +79,7 @@ class Pace:
         self._stretches = None if stretch is None else (stretch, stretch)  # before and after the newest change
         self._record: mmap.mmap | None = None
         self._words = memoryview(bytes(8)).cast("Q")
-        self._number = 0  # of the record in _stretches
+        self._number = 0  # number of the record in _stretches
 
     @classmethod
     def from_now(cls, factor: float) -> Pace:
@@ -97,12 +97,12 @@ class Pace:
 
     @property
     def factor(self) -> float:
-        """Seconds of the stack per second of the machine, at present."""
+        """Present seconds of the stack per second of the machine."""
         return 1.0 if self._stretches is None else self._at(time.monotonic_ns()).factor
 
     @property
     def text(self) -> str:
-        """The pace for the operator; empty in real time."""
+        """Text about the pace for the operator; empty in real time."""
         return describe(self.factor, self.adapts)
 
     def now_ns(self) -> int:
@@ -128,7 +128,7 @@ class Pace:
     def wait_s(self, seconds: float) -> float:
         """Convert seconds of the stack, from now on, to seconds of the machine.
 
-        A result above ``LEAD_S`` does not include changes that are not written yet: wait again for what is left.
+        A result above ``LEAD_S`` may be wrong, because the pace can change meanwhile: wait, then convert the rest.
         """
         if self._stretches is None:
             return seconds
@@ -140,7 +140,7 @@ class Pace:
         return seconds / stretch.factor
 
     def timeout_s(self, seconds: float) -> float:
-        """Convert a time-out in seconds of the stack to one on the machine's clock that holds at any later pace."""
+        """Convert a time-out in seconds of the stack to machine seconds that suffice at any later pace."""
         return seconds / (SLOWEST_CHOSEN if self.adapts else self.factor)
 
     def sleep(self, seconds: float) -> None:
@@ -161,7 +161,7 @@ class Pace:
         return stretch.epoch_ns + stretch.since_begin_ns(then_ns)
 
     def _at(self, monotonic_ns: int) -> Stretch:
-        """Return the stretch of an instant; read the clock before the call, so that no change can come in between."""
+        """Return the stretch at an instant. Read the clock before this call, so that no change can come in between."""
         if self._words[0] != self._number and self._record is not None:
             self._take(self._record[:])
         assert self._stretches is not None
@@ -169,7 +169,7 @@ class Pace:
         return newest if monotonic_ns >= newest.monotonic_ns else before
 
     def _take(self, record: bytes) -> bool:
-        """Take over a record; False while it is being written."""
+        """Take over a record. Return False if it is being written."""
         number, adapts, *fields, crc = _RECORD.unpack(record)
         if crc != zlib.crc32(record[:-8]):
             return False
@@ -190,12 +190,12 @@ class Pace:
 
 
 class PaceFiles:
-    """The pace in the run directories of a stack, one for each of its groups; only the launcher writes it.
+    """The pace files in the run directories of a stack, one per group. Only the launcher writes them.
 
     Args:
         folders: run directories.
         factor: pace at the start.
-        adapts: whether :meth:`change` will be called.
+        adapts: true if :meth:`change` may be called later.
 
     Raises:
         PaceError: the factor is out of range.
@@ -209,11 +209,11 @@ class PaceFiles:
 
     @property
     def factor(self) -> float:
-        """The factor written last."""
+        """The newest factor written."""
         return self._newest.factor
 
     def change(self, factor: float) -> None:
-        """Change the pace in ``LEAD_S`` machine seconds; nothing happens while an earlier change is still ahead.
+        """Change the pace in ``LEAD_S`` machine seconds. Do nothing while an earlier change is still ahead.
 
         Raises:
             PaceError: the factor is out of range.
@@ -233,10 +233,10 @@ class PaceFiles:
 
 
 def check_factor(factor: float) -> float:
-    """Return the factor.
+    """Return the factor if it is in range.
 
     Raises:
-        PaceError: it is out of range.
+        PaceError: the factor is out of range.
     """
     if not (math.isfinite(factor) and SLOWEST <= factor <= FASTEST):
         raise PaceError(f"pace must lie in {SLOWEST}..{FASTEST:g} (got {factor:g})")
@@ -244,7 +244,7 @@ def check_factor(factor: float) -> float:
 
 
 def describe(factor: float, adapts: bool) -> str:
-    """Return the pace for the operator; empty in real time. One that adapts is rounded, so that it changes rarely."""
+    """Return a text about the pace; empty in real time. An adapting pace is rounded, so the text rarely changes."""
     factor = round(factor, 1) if adapts else factor
     if factor == 1.0:
         return ""
@@ -260,29 +260,29 @@ def current() -> Pace:
 
 
 def use(pace: Pace) -> None:
-    """Set this process's pace; call it before the clocks are made."""
+    """Set this process's pace. Call this before creating clocks."""
     global _current
     _current = pace
 
 
 def suspended_ns() -> int:
-    """Return the nanoseconds for which this machine was suspended; too few if the process is held up meanwhile.
+    """Return the nanoseconds for which this machine was suspended, or less if the process is delayed meanwhile.
 
-    A paused virtual machine does not see its pause.
+    A virtual machine does not notice when it is paused.
     """
-    # In this order: a process that is held up between the two must not look suspended.
+    # The order matters: a process delayed between the two readings must not appear suspended.
     since_start_ns = time.clock_gettime_ns(time.CLOCK_BOOTTIME)
     return since_start_ns - time.monotonic_ns()
 
 
 def remove_files(folders: Iterable[Path]) -> None:
-    """Return run directories to the machine's own time, for processes that start from now on."""
+    """Remove the pace files, so that processes started from now on run on the machine's own time."""
     for folder in folders:
         (folder / FILE).unlink(missing_ok=True)
 
 
 def _create(file: Path, content: bytes) -> mmap.mmap:
-    """Replace a file and map the new one; processes that mapped the old one keep it."""
+    """Replace a file and map the new one. Processes that have mapped the old one keep it."""
     with replacing(file, private=True) as stream:
         stream.write(content)
         stream.flush()
@@ -290,10 +290,10 @@ def _create(file: Path, content: bytes) -> mmap.mmap:
 
 
 def read(run_dir: Path) -> Pace:
-    """Return the pace of a run directory; it follows the launcher's changes. Without a file it is the machine's own.
+    """Return the pace of a run directory, which follows the launcher's changes; real time if there is no pace file.
 
     Raises:
-        PaceError: its file is damaged.
+        PaceError: the pace file cannot be read or is damaged.
     """
     file = run_dir / FILE
     try:

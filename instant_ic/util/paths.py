@@ -21,7 +21,7 @@ def share_dir(name: str) -> Path:
 
 
 def is_file(path: Path) -> bool:
-    """Return whether a file is there; false also for a name that is too long, for which ``Path.is_file`` raises."""
+    """Return whether a file exists. A name that is too long is False, though ``Path.is_file`` would raise."""
     try:
         return path.is_file()
     except OSError:
@@ -29,7 +29,7 @@ def is_file(path: Path) -> bool:
 
 
 def shipped_file(folder: str, name: str) -> Path:
-    """Return the path of a file in ``launch``, ``config`` or ``models``; the error for a missing one lists them."""
+    """Return the path of a file in ``launch``, ``config`` or ``models``. The error lists the folder's files."""
     path = share_dir(folder) / name
     if not is_file(path):
         have = ", ".join(sorted(entry.name for entry in share_dir(folder).iterdir())) or "nothing"
@@ -43,7 +43,7 @@ def node_names() -> list[str]:
 
 
 def node_file(name: str) -> Path:
-    """Return the path of the shipped node of this name, whether it exists or not."""
+    """Return the path that a shipped node of this name has, whether or not it exists."""
     return share_dir("nodes") / f"{name}.py"
 
 
@@ -58,14 +58,14 @@ def run_dir() -> Path:
 
 
 def default_run_dir() -> Path:
-    """Return the run directory used when none is given; it does not survive the machine's shutdown."""
+    """Return the run directory used when none is set. It does not survive the machine's shutdown."""
     if runtime := os.environ.get("XDG_RUNTIME_DIR"):
         return Path(runtime) / "instant_ic"
     return Path(f"/tmp/instant_ic-{os.getuid()}")
 
 
 def sign_in_file(run_dir: Path, node: str) -> Path:
-    """Return the file with a console's address and token, readable by its user only, unlike the log."""
+    """Return the file for a console's address and token. Unlike the log, only its user can read it."""
     return run_dir / f"{node}.sign_in"
 
 

@@ -1,4 +1,4 @@
-"""Create folders and files that only their owner can read, whatever the umask."""
+"""Folders and files that only their owner can read, independent of the umask."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ log = logging.getLogger(__name__)
 
 
 def make_folder(path: Path, exist_ok: bool = False) -> None:
-    """Create a folder and its missing parents, each with mode 0700; an existing one keeps its mode.
+    """Create a folder and its missing parents, each with mode 0700. Existing folders keep their mode.
 
     Raises:
-        FileExistsError: it exists and ``exist_ok`` is false, or it is not a folder.
-        OSError: it cannot be created.
+        FileExistsError: the folder exists and ``exist_ok`` is false, or the path is not a folder.
+        OSError: the folder cannot be created.
     """
     try:
         path.mkdir(mode=0o700)
@@ -30,13 +30,13 @@ def make_folder(path: Path, exist_ok: bool = False) -> None:
 
 
 def open_file(path: Path, flags: int) -> int:
-    """Open a file and set its mode to 0600, whether new or existing; never follows a symbolic link.
+    """Open a new or existing file and set its mode to 0600. Symbolic links are not followed.
 
     Returns:
         A descriptor that child processes do not inherit.
 
     Raises:
-        OSError: it cannot be opened.
+        OSError: the file cannot be opened.
     """
     descriptor = os.open(path, flags | os.O_NOFOLLOW | os.O_CLOEXEC, 0o600)
     _restrict(path, os.fstat(descriptor).st_mode, 0o600, lambda mode: os.fchmod(descriptor, mode))
@@ -44,7 +44,7 @@ def open_file(path: Path, flags: int) -> int:
 
 
 def sync_folder(path: Path) -> None:
-    """Write the entries of a folder to the disk, so that its new files survive a power failure.
+    """Sync the entries of a folder to the disk, so that its new files survive a power failure.
 
     Raises:
         OSError: the disk failed.
@@ -57,12 +57,12 @@ def sync_folder(path: Path) -> None:
 
 
 def read_secret(path: Path) -> str:
-    """Return the text of a file that only its owner can read, without white space around it.
+    """Return the text of a file that only its owner can read, without surrounding white space.
 
     Raises:
-        PermissionError: others may read the file; the text says what to do.
-        OSError: it cannot be read.
-        UnicodeDecodeError: it is no text.
+        PermissionError: others may read the file.
+        OSError: the file cannot be read.
+        UnicodeDecodeError: the file is not UTF-8 text.
     """
     with path.open(encoding="utf-8") as file:
         if os.fstat(file.fileno()).st_mode & 0o077:
@@ -75,5 +75,5 @@ def _restrict(path: Path, present: int, mode: int, change: Callable[[int], None]
         return
     try:
         change(mode)
-    except OSError as error:  # a USB stick with FAT has no modes; an unprotected recording is better than none
+    except OSError as error:  # FAT on a USB stick has no modes, and an unprotected recording is better than none
         log.warning("%s cannot be hidden from other users (mode %04o): %s", path, mode, error.strerror)

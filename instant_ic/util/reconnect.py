@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 STARTS_S = 15.0
-"""A device that was never connected may still be starting for this long, so the waits do not grow yet."""
+"""Time from the first failure during which waits do not grow, because the device may still be starting."""
 
 
 class Backoff:
-    """A wait that doubles with every failure, from the first one on that is not part of the start.
+    """Wait between attempts that doubles with every failure, except while the device may still be starting.
 
     Args:
-        min_s: first wait.
-        max_s: longest wait.
+        min_s: first wait in seconds.
+        max_s: longest wait in seconds.
     """
 
     def __init__(self, min_s: float, max_s: float) -> None:
@@ -25,7 +25,7 @@ class Backoff:
         """Return the wait before the next attempt, and double the one after it.
 
         Args:
-            now_s: any steady clock.
+            now_s: time now on any steady clock, in seconds.
         """
         if self._began_s is None:
             self._began_s = now_s
@@ -35,6 +35,6 @@ class Backoff:
         return wait_s
 
     def succeed(self) -> None:
-        """Start again with the shortest wait: the connection works."""
+        """Start again with the shortest wait, because the connection works."""
         self._connected = True
         self.wait_s = self._min_s

@@ -1,4 +1,4 @@
-"""Notices a source that sends the same data again: measurements have noise, so equal ones are copies."""
+"""Detection of a source that sends old data again. Measurements have noise, so equal ones are copies."""
 
 from __future__ import annotations
 
@@ -6,14 +6,14 @@ import zlib
 from collections import deque
 
 REMEMBERED = 128
-"""Number of different measurements that are remembered: rings of old buffers and short recordings repeat many."""
+"""Number of different measurements remembered, because ring buffers and short recordings repeat many."""
 
 
 class RepeatWatch:
-    """Compares each measurement with the ones before.
+    """Compares each measurement with earlier ones.
 
     Attributes:
-        copies: number of consecutive measurements that were sent before.
+        copies: number of copies received in a row.
     """
 
     def __init__(self) -> None:
@@ -21,7 +21,7 @@ class RepeatWatch:
         self._known: deque[int] = deque(maxlen=REMEMBERED)
 
     def is_new(self, *parts: bytes) -> bool:
-        """Return whether a measurement, given in one or more parts, differs from those before."""
+        """Return whether a measurement, given in one or more parts, differs from the earlier ones."""
         digest = 0
         for part in parts:
             digest = zlib.crc32(part, digest)
@@ -33,6 +33,6 @@ class RepeatWatch:
         return True
 
     def forget(self) -> None:
-        """Forget the measurements before."""
+        """Forget the earlier measurements."""
         self._known.clear()
         self.copies = 0

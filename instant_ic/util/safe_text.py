@@ -1,7 +1,7 @@
-"""Text that is safe to show: no control characters of strangers, no passwords.
+"""Text that is safe to show, without control characters and passwords.
 
-Names and texts of bags, peers and files may hold escape sequences, which a terminal would obey. Addresses may hold a
-password or token, which logs, bags and parameters would spread.
+Names and texts from bags, peers and files may hold escape sequences, which a terminal would execute. Addresses may hold
+a password or token, which logs, bags and parameters would spread.
 """
 
 from __future__ import annotations
@@ -16,35 +16,35 @@ _CONTROL = re.compile(
     r"\u200b\u2060-\u2065\ufeff\U000e0000-\U000e007f"
     r"\ud800-\udfff]"
 )
-"""Control characters but tab and line feed, those that change the direction of writing, those that show nothing, and
-halves of surrogate pairs, which no terminal takes."""
+"""Control characters except tab and line feed, characters that change the direction of writing or are invisible, and
+halves of surrogate pairs, which terminals do not accept."""
 _COLOUR = re.compile(r"(\x1b\[[\d;]*m)")
 _USER = re.compile(r"(://(?!\[)[^\s/:]*):(?!\d*(?:[/?#\s\"',)\]}]|$))\S*@")
-"""User and password. A slash may be in the password, but behind digits it ends a port."""
+"""User and password. A slash may be part of the password, but after digits it ends a port number."""
 _TOKEN = re.compile(r"([?&;#](?:token|pass(?:word|wd)?|pwd)=)(?!\{password\}(?:[\s&;#]|$))[^\s&;]+", re.IGNORECASE)
-"""Password or token in a query; ``{password}`` is only the place for one."""
+"""Password or token in a query. ``{password}`` is only a placeholder."""
 
 
 def visible(text: str, *, colours: bool = False) -> str:
-    """Return a text with its control characters written out, such as ``ESC`` as backslash, x1b.
+    r"""Return a text with its control characters written out, such as ``\x1b`` for ESC.
 
     Args:
         text: any text.
-        colours: keep the sequences that set colours.
+        colours: keep escape sequences that set colours.
     """
     if colours:
-        parts = _COLOUR.split(text)  # colours at the odd places
+        parts = _COLOUR.split(text)  # colour sequences have odd indices
         return "".join(part if index % 2 else visible(part) for index, part in enumerate(parts))
     return _CONTROL.sub(lambda found: ascii(found[0])[1:-1], text)
 
 
 def masked(text: str) -> str:
-    """Return a text with the passwords and tokens of its addresses replaced by ``***``."""
+    """Return a text with the passwords and tokens in its addresses replaced by ``***``."""
     return _TOKEN.sub(r"\1***", _USER.sub(r"\1:***@", text))
 
 
 def holds_password(address: str) -> bool:
-    """Return whether an address has a password or token in it, before the host or in its query."""
+    """Return whether an address contains a password or token, before the host or in its query."""
     return _USER.search(address) is not None or _TOKEN.search(address) is not None
 
 
@@ -60,7 +60,7 @@ def masked_values(value: Any) -> Any:
 
 
 class VisibleStream:
-    """Text stream that shows control characters and hides passwords; :func:`direct` returns the stream below it."""
+    """Text stream that writes control characters out and masks passwords; :func:`direct` bypasses it."""
 
     def __init__(self, stream: TextIO) -> None:
         self.stream = stream
@@ -78,6 +78,6 @@ class VisibleStream:
 
 
 def direct(stream: Any) -> TextIO:
-    """Return the stream for a program's own colours and cursor movements; what it gets must be ``visible``."""
+    """Return the unfiltered stream, for a program's own colours and cursor movements; filter text by `visible`."""
     below: TextIO = stream.stream if isinstance(stream, VisibleStream) else stream
     return below

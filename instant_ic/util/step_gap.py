@@ -1,8 +1,8 @@
-"""Watch over a process's own steps: a process that stood still must not go on as if nothing had happened.
+"""Watch over a process's own steps, so that a process that was frozen does not continue as if nothing had happened.
 
-Time-outs watch the sources of a process, but nothing watches the process itself while it is frozen (SIGSTOP, swapping,
-a suspended machine). Afterwards it finds messages that have waited, and an operator's key that is still held. So each
-process that commands motion looks at the time since its own last step.
+Time-outs watch the inputs of a process, but not the process itself while it is frozen (SIGSTOP, swapping, a suspended
+machine). When it continues, it finds old messages, and perhaps an operator's key that is still held. Each process that
+commands motion therefore checks the time since its own last step.
 """
 
 from __future__ import annotations
@@ -10,26 +10,26 @@ from __future__ import annotations
 import math
 
 BRIEF_S = 0.3
-"""Longest time between two steps without a stop, in seconds of the stack."""
+"""Longest time between two steps that does not count as a gap, in seconds of the stack."""
 SETTLE_S = 0.3
-"""Time after a gap in which nothing moves: what waited meanwhile is then read, and a source that has ended is stale."""
+"""Time after a gap during which nothing moves, in seconds. Afterwards, old messages are read and dead inputs stale."""
 _SUSPENDED_NS = 50_000_000
-"""A machine was suspended if the difference between its two clocks has grown by more than this."""
+"""Growth of the difference between the machine's two clocks above which it was suspended."""
 
 
 class StepGap:
-    """Time between the steps of one process; the caller passes the clocks of :class:`~instant_ic.bus.clock.Clock`."""
+    """Time between the steps of one process. The caller passes the times of a :class:`~instant_ic.bus.clock.Clock`."""
 
     def __init__(self) -> None:
         self._stepped_ns: int | None = None
-        self._ended_ns: int | None = None  # when the last gap ended
+        self._ended_ns: int | None = None  # steady time at which the last gap ended
         self._suspended_ns = 0
 
     def step(self, steady_ns: int, suspended_ns: int) -> float:
-        """Note a step.
+        """Record a step.
 
         Returns:
-            Seconds since the step before if that is a gap, 0 if not; inf if the machine was suspended.
+            Seconds since the previous step if that is a gap, otherwise 0; inf if the machine was suspended.
         """
         before_ns, self._stepped_ns = self._stepped_ns, steady_ns
         slept_ns, self._suspended_ns = suspended_ns - self._suspended_ns, max(suspended_ns, self._suspended_ns)
@@ -42,7 +42,7 @@ class StepGap:
         return gap_s
 
     def pause(self) -> None:
-        """Let the time until the next step be no gap: the process has nothing to do."""
+        """Do not count the time until the next step as a gap, because the process has nothing to do."""
         self._stepped_ns = None
 
     def settles(self, steady_ns: int) -> bool:

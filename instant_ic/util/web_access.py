@@ -1,4 +1,4 @@
-"""Access to a server of this machine: sign-in, Host and Origin headers, and the rate of one client."""
+"""Access to a server on this machine: sign-in, Host and Origin headers, and a rate limit per client."""
 
 from __future__ import annotations
 
@@ -20,22 +20,23 @@ logger = logging.getLogger(__name__)
 
 
 class AccessError(ValueError):
-    """A token or certificate cannot be used; the text says which and what to do."""
+    """A token or certificate cannot be used."""
 
 
 def sign_in_needed(sign_in: str, host: str, simulated: bool) -> bool:
-    """Return whether a server asks for a token. Other users of this machine may not drive a real robot either.
+    """Return whether a server asks for a token.
 
     Args:
-        sign_in: one of ``SIGN_IN``; ``auto`` asks unless the server is on loopback and its robots are simulated.
+        sign_in: one of ``SIGN_IN``; ``auto`` asks unless the server is on loopback and its robots are simulated. Even
+            on loopback, other users of this machine must not drive a real robot.
         host: listen address.
-        simulated: whether nothing real can move. False also if that is not known.
+        simulated: true if it is certain that nothing real can move.
     """
     return sign_in == "always" or (sign_in == "auto" and not (simulated and is_loopback(host)))
 
 
 def offer_sign_in(address: str, file: Path) -> None:
-    """Write an address with its token to a file that only its owner can read, and show it on a terminal.
+    """Write an address with its token to a file that only its owner can read, and print it if on a terminal.
 
     The token is never logged, because the log goes to ``/rosout`` and into bags.
 
@@ -65,8 +66,8 @@ def is_loopback(host: str) -> bool:
 def host_allowed(host: str, allowed: Sequence[str]) -> bool:
     """Return whether a Host header names this machine: an address, ``localhost`` or one of ``allowed``.
 
-    A foreign site can point its own name at this machine (DNS rebinding); then its Origin equals its Host. But it
-    cannot make a browser send an address or ``localhost``.
+    A foreign site can point its own name at this machine (DNS rebinding), and then its Origin equals its Host. It
+    cannot make a browser send an IP address or ``localhost``, however.
     """
     name = _hostname(f"//{host}")
     return name is not None and (name in ("localhost", *(entry.lower() for entry in allowed)) or _is_address(name))
@@ -76,7 +77,7 @@ def refusal(origin: str | None, host: str | None, origins: Sequence[str], hosts:
     """Return why a request is refused; empty if it is allowed.
 
     Args:
-        origin: Origin header; None if there is none, as for programs other than browsers.
+        origin: Origin header; None if there is none, as from programs other than browsers.
         host: Host header.
         origins: pages that may connect in addition to those of this machine; ``*`` allows every page.
         hosts: see :func:`host_allowed`.
@@ -95,9 +96,9 @@ class TokenBucket:
     """Token bucket: ``rate`` tokens a second on average, ``burst`` at once. The caller passes the time.
 
     Args:
-        rate: tokens added each second.
+        rate: tokens added per second.
         burst: capacity.
-        first: tokens at the start; default ``burst``.
+        first: tokens at the start; None starts with ``burst``.
     """
 
     __slots__ = ("_at", "_tokens", "burst", "rate")
@@ -107,7 +108,7 @@ class TokenBucket:
         self._tokens, self._at = burst if first is None else first, -math.inf
 
     def take(self, now: float, amount: float = 1.0) -> bool:
-        """Take ``amount`` tokens if available, else none; return whether they were taken."""
+        """Take ``amount`` tokens if they are available. Return whether they were taken."""
         if self._at > -math.inf:
             self._tokens = min(self.burst, self._tokens + (now - self._at) * self.rate)
         self._at = now
@@ -126,7 +127,7 @@ class TokenBucket:
 
 
 class AddressBuckets:
-    """Token bucket for each address; the least recently used address is dropped first."""
+    """A token bucket for each address. The least recently used address is dropped first."""
 
     def __init__(self, rate: float, burst: float) -> None:
         self._rate, self._burst = rate, burst
@@ -142,7 +143,7 @@ class AddressBuckets:
 
 
 def network_of(host: str) -> str:
-    """Return the key by which an address is limited: IPv4 in full, IPv6 by its /64, which belongs to one subscriber."""
+    """Return the limited network of an address: the whole IPv4 address, or the /64 of an IPv6 subscriber."""
     try:
         address = ipaddress.ip_address(host.partition("%")[0])
     except ValueError:

@@ -135,7 +135,7 @@ def test_protection_that_is_off_warns_as_long_as_it_is_off() -> None:
 
 def test_a_base_that_obeys_anybody_warns_and_needs_a_word() -> None:
     for word in ('command_source:=""', "accept_unstamped:=true"):
-        with pytest.raises(ParameterError, match="protection is off, so that commands of any node or of any age"):
+        with pytest.raises(ParameterError, match="protection is off, so commands of any node or of any age"):
             configured("crawler_base", word)
     bench = NodeBench(command_source="", unprotected=True)
     bench.run(1.0)
