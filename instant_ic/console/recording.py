@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import threading
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import PurePath
 from typing import Any
 
@@ -33,6 +33,7 @@ class RecordingDesk:
         self._report = report
         self._thread = ThreadPoolExecutor(1, "recording desk")
         self._places = threading.Semaphore(MOST_PENDING)
+        self._poll: Future[None] | None = None
         self._recording = False
         self._notice: dict[str, Any] = {"number": 0, "text": "", "level": "ok"}
 
@@ -54,22 +55,20 @@ class RecordingDesk:
         self._submit(lambda: f"Bookmark set: {name}" + ("" if self._recording else " (not recording)"))
 
     def poll(self) -> None:
-        """Report the recorder's state."""
-        self._submit(None)
+        """Report the recorder's state, unless the recorder has not answered the last poll yet."""
+        if self._poll is None or self._poll.done():
+            self._poll = self._thread.submit(self._do, None)
 
-    def _submit(self, command: Callable[[], str] | None) -> None:
+    def _submit(self, command: Callable[[], str]) -> None:
         if self._places.acquire(blocking=False):
-            self._thread.submit(self._do, command)
-        elif command is not None:
+            self._thread.submit(self._do, command).add_done_callback(lambda _: self._places.release())
+        else:
             logger.warning("Recorder command dropped: %d are pending. Wait, then try again.", MOST_PENDING)
 
     def _do(self, command: Callable[[], str] | None) -> None:
-        try:
-            if command is not None:
-                self._notice = {"number": self._notice["number"] + 1} | self._outcome(command)
-            self._report(self.status())
-        finally:
-            self._places.release()
+        if command is not None:
+            self._notice = {"number": self._notice["number"] + 1} | self._outcome(command)
+        self._report(self.status())
 
     def _outcome(self, command: Callable[[], str]) -> dict[str, str]:
         try:

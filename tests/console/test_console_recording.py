@@ -11,7 +11,7 @@ from instant_ic.bus.control import ControlServer
 from instant_ic.bus.lockstep import LockstepBus
 from instant_ic.console import ConsoleClient
 from instant_ic.console.config import ConsoleConfig
-from instant_ic.console.recording import RecorderError, RecordingDesk
+from instant_ic.console.recording import MOST_PENDING, RecorderError, RecordingDesk
 from nodes.console import ConsoleNode
 
 
@@ -72,6 +72,24 @@ def test_a_missing_recorder_and_a_refusal_are_told_in_words_and_the_next_wish_co
     made.record(True)
     told = report()
     assert (told["notice"]["number"], told["notice"]["level"]) == (2, "ok")
+
+
+def test_the_polls_of_a_recorder_that_hangs_displace_no_command():
+    answers, reports = queue.Queue(), queue.Queue()
+
+    def ask(command):
+        answers.get(timeout=WAIT_S)
+        return {"path": f"/d/{command}"}
+
+    desk = RecordingDesk(ask, reports.put)
+    for _ in range(2 * MOST_PENDING):
+        desk.poll()
+    desk.record(True)
+    for _ in range(3):  # the first poll, the command, the status after it
+        answers.put(None)
+    notices = [reports.get(timeout=WAIT_S)["notice"]["text"] for _ in range(2)]
+    desk.stop()
+    assert notices == ["", "Recording to record"]
 
 
 # ---- the node --------------------------------------------------------------------------------------
