@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import os
+import threading
 from collections.abc import Callable
 from contextlib import suppress
 from io import FileIO
@@ -28,10 +29,16 @@ class NodeLog:
         self._file: FileIO | None = None
         self._size = 0
         self._failed = False
+        # A process that outlives its node may hold the pipe: then the threads of two runs use this log.
+        self._lock = threading.RLock()
         self._rotate()
 
     def write(self, data: bytes) -> None:
         """Append to the file."""
+        with self._lock:
+            self._write(data)
+
+    def _write(self, data: bytes) -> None:
         try:
             if self._size + len(data) > self._max_bytes:
                 self.close()
@@ -51,10 +58,11 @@ class NodeLog:
 
     def close(self) -> None:
         """Close the file; a later write opens it again."""
-        if self._file is not None:
-            file, self._file = self._file, None
-            with suppress(OSError):  # write() has already reported a full disk
-                file.close()
+        with self._lock:
+            if self._file is not None:
+                file, self._file = self._file, None
+                with suppress(OSError):  # write() has already reported a full disk
+                    file.close()
 
     def _open(self) -> None:
         make_folder(self.path.parent, exist_ok=True)

@@ -5,6 +5,7 @@ import signal
 import subprocess
 import sys
 import textwrap
+import threading
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -421,6 +422,25 @@ def test_full_disk_for_a_log_is_reported_once(tmp_path: Path, monkeypatch: pytes
     log.write(b"kept line\n")
     log.close()
     assert len(reports) == 1 and path.read_text() == "kept line\n"
+
+
+def test_a_log_is_not_closed_while_another_thread_writes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A process that outlives its node holds the old pipe: its end must not end the output of the new run."""
+    reader, writer = os.pipe()
+    (tmp_path / "node.log").write_bytes(b"")
+    monkeypatch.setattr(node_log, "open_file", lambda path, flags: writer)
+    log = NodeLog(tmp_path / "node.log", lambda text: None)
+    (tmp_path / "node.log").write_bytes(b"")
+    threads = [threading.Thread(target=log.write, args=(bytes(1 << 20),)), threading.Thread(target=log.close)]
+    threads[0].start()
+    with os.fdopen(reader, "rb") as pipe:
+        pipe.read(1)  # the write has begun, and the pipe is full
+        threads[1].start()
+        threads[1].join(0.1)
+        assert threads[1].is_alive()
+        assert len(pipe.read()) == (1 << 20) - 1
+    for thread in threads:
+        thread.join()
 
 
 def test_a_log_folder_that_cannot_be_written_does_not_keep_the_node_from_running(run_dir: Path) -> None:
