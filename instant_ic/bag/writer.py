@@ -184,6 +184,7 @@ class BagWriter(Closing):
         """Write index and metadata. Idempotent."""
         if not self._closed:
             self._closed = True
+            self._latched = LatchedValues()  # a recorder keeps the writers of its snapshots
             self.end_file()
 
     # -- internals -------------------------------------------------------------------------------

@@ -1,6 +1,7 @@
 """Bags of several files: where they are split, what each begins with, how they read as one."""
 
 import json
+import sys
 from pathlib import Path
 
 import pytest
@@ -180,3 +181,12 @@ def test_unknown_type_is_kept_as_bytes_without_definition(tmp_path: Path, caplog
         ]
         with pytest.raises(BagError, match=r"/odd: type their_msgs/msg/Odd is unknown"):
             reader.decoder(reader.topics[0])
+
+
+def test_a_closed_writer_holds_no_payload(tmp_path: Path) -> None:
+    """A recorder keeps the writers of all its snapshots; a latched map takes megabytes."""
+    payload = bytes(1000)
+    before = sys.getrefcount(payload)
+    with BagWriter(tmp_path / "b") as writer:
+        writer.write("/map", BOOL, payload, 1 * S, LATCHED)
+    assert sys.getrefcount(payload) == before and writer.count == 1
