@@ -124,7 +124,7 @@ class Recorder:
         if self.bag is not None and not self.bag.done:
             doing = "completed" if self.bag.state == ENDING else "recorded"
             raise ValueError(f"{self.bag.path} is being {doing} already")
-        self.bag = self._open(_dated(self.path, name, "rec_"), lost_before=self.lost_by())
+        self.bag = self._open(self._dated(name, "rec_"), lost_before=self.lost_by())
         for value in cache.latched():
             self.bag.put(value, old=True)
         return self.bag.path
@@ -153,7 +153,7 @@ class Recorder:
         for snapshot in self.snapshots:
             if snapshot.state == RECORDING:  # a running snapshot includes this moment
                 return snapshot
-        path, until_s = _dated(self.path, reason), time.monotonic() + after_s
+        path, until_s = self._dated(reason), time.monotonic() + after_s
         self.snapshots.append(self._open(path, content, until_s))
         self.tick()
         return self.snapshots[-1]
@@ -244,6 +244,16 @@ class Recorder:
 
         return Recording(path, self.options, custom, content, until_s, self._free_bytes)
 
+    def _dated(self, name: str, prefix: str = "") -> Path:
+        """Return an unused path, made of date, time and those characters of ``name`` that a path may have."""
+        slug = "".join(c if c.isalnum() else "_" for c in name.strip())[:40].strip("_")
+        stem = f"{prefix}{datetime.now():%Y%m%d_%H%M%S}" + (f"_{slug}" if slug else "")
+        path, number = self.path / stem, 1
+        while path.exists() or any(bag.path == path for bag in self._bags):  # a snapshot's thread creates its folder
+            number += 1
+            path = self.path / f"{stem}_{number}"
+        return path
+
     def _snapshot_cache(self) -> SnapshotCache:
         if self._cache is None:
             raise ValueError("the recorder records all the time; start it with --snapshot to record on request")
@@ -274,17 +284,6 @@ class Recorder:
         bag = self.bag.status()
         size = f"{bag['bytes'] / 1e6:.1f} MB in {bag['files']} files"
         return f"{bag['messages']} messages, {topics}, {bag['state']}, {size}"
-
-
-def _dated(folder: Path, name: str, prefix: str = "") -> Path:
-    """Return an unused path in ``folder``, made of date, time and those characters of ``name`` that a path may have."""
-    slug = "".join(c if c.isalnum() else "_" for c in name.strip())[:40].strip("_")
-    stem = f"{prefix}{datetime.now():%Y%m%d_%H%M%S}" + (f"_{slug}" if slug else "")
-    path, number = folder / stem, 1
-    while path.exists():
-        number += 1
-        path = folder / f"{stem}_{number}"
-    return path
 
 
 def _on_disk(path: Path) -> Path:

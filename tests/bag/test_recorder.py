@@ -305,10 +305,11 @@ def test_a_snapshot_waits_for_no_disk_and_one_that_cannot_be_written_is_told(
     recorder.take("/scan", BOOL, b"1", 1 * S)
     disk.hang()
     first = recorder.snapshot("hanging")  # returns although not even its file can be begun
-    assert not first.done
+    another = recorder.snapshot("hanging")  # in the same second
+    assert not first.done and not another.done
     disk.go.set()
-    wait_for(lambda: first.done, "the snapshot")
-    assert not first.error
+    wait_for(lambda: first.done and another.done, "the snapshots")
+    assert not first.error and not another.error and first.path != another.path
     monkeypatch.setattr("instant_ic.bag.writer.make_folder", refuse_folder)
     second = recorder.snapshot("refused")
     wait_for(lambda: second.done, "the refusal")
