@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 
 def psnr_db(a: NDArray[np.uint8], b: NDArray[np.uint8]) -> float:
-    """Return the peak signal-to-noise ratio of two 8-bit images of one shape, dB; inf if they are equal."""
+    """Return the peak signal-to-noise ratio in dB of two 8-bit images of the same shape; inf if they are equal."""
     error = float(np.mean((a.astype(np.float64) - b.astype(np.float64)) ** 2))
     return float("inf") if error == 0 else 10 * float(np.log10(255.0**2 / error))
 

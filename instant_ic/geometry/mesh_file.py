@@ -1,4 +1,4 @@
-"""Loader of mesh files (GLB, glTF, PLY, OBJ) on trimesh, within limits on what a file may declare."""
+"""Loader of mesh files (GLB, glTF, PLY, OBJ) by trimesh, with limits on the sizes that a file may declare."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ Floats = NDArray[np.float32]
 SUFFIXES = (".glb", ".gltf", ".ply", ".obj")
 Y_UP_SUFFIXES = (".glb", ".gltf")
 MAX_FILE_BYTES = 2 << 30
-"""Larger files are refused unread: their triangles would not fit into the memory of a robot's station."""
+"""Larger files are refused before reading, because their triangles would not fit into the memory of the station."""
 GREY = 0.85
-"""Colour of a surface without any, sRGB 0 to 1."""
+"""Colour of a surface that has none, sRGB 0 to 1."""
 _Z_UP_FROM_Y_UP = np.array([[1.0, 0, 0], [0, 0, -1.0], [0, 1.0, 0]])
 """glTF has y up and looks along z: (x, y, z) becomes (x, −z, y)."""
 
@@ -34,7 +34,7 @@ class ColouredMesh:
 
     Attributes:
         triangles: corners in metres, z up, (T, 3, 3).
-        corner_uv: texture coordinates of the corners, v downwards, 1 = the whole image, (T, 3, 2).
+        corner_uv: texture coordinates of the corners, v downwards, 0 to 1 over the image, (T, 3, 2).
         corner_rgb: sRGB colours of the corners, 0 to 255, (T, 3, 3); used where there is no texture.
         texture: index of each triangle's image, −1 for none, (T,).
         images: textures in the colour of their material, sRGB, (H, W, 3) uint8 each.
@@ -48,16 +48,16 @@ class ColouredMesh:
 
 
 def load_mesh(path: str | Path, max_triangles: int = 5_000_000) -> ColouredMesh:
-    """Load the triangles of a file that have an area, with node transforms applied.
+    """Load the triangles of a file with node transforms applied; triangles without an area are left out.
 
-    glTF has y up by its standard and is turned; the others are taken as they are, with z up.
+    glTF has y up by its standard and is turned. The other formats are read as they are, with z up.
 
     Args:
         path: GLB, glTF, PLY or OBJ file.
-        max_triangles: largest number of triangles; one geometry counts at each of its nodes.
+        max_triangles: largest number of triangles; a geometry counts once for each of its nodes.
 
     Raises:
-        MeshError: no such file, another kind of file, damaged, without triangles, or too large.
+        MeshError: the file is missing, of another kind, damaged, without triangles, or too large.
     """
     path = Path(path)
     if not path.is_file():
@@ -92,20 +92,20 @@ def load_mesh(path: str | Path, max_triangles: int = 5_000_000) -> ColouredMesh:
 
 
 def doubled_areas(triangles: Floats) -> NDArray[np.float64]:
-    """Return the normals of triangles (T, 3, 3), of the length of twice their areas, (T, 3)."""
+    """Return the normals (T, 3) of triangles (T, 3, 3); a normal's length is twice its triangle's area."""
     edges = triangles[:, 1:] - triangles[:, :1]
     return np.cross(edges[:, 0].astype(np.float64), edges[:, 1])
 
 
 def _check_accessors(path: Path, most: int) -> None:
-    """Check that the arrays of a glTF are in its buffers: 50 bytes can declare any number of zeros without one.
+    """Check that a glTF's arrays are in its buffers. Without a buffer, 50 bytes can declare any number of zeros.
 
     Args:
         path: the file.
         most: largest number of elements of an array.
 
     Raises:
-        MeshError: an array without a buffer, or with more elements.
+        MeshError: an array has no buffer, or more than ``most`` elements.
     """
     content = path.read_bytes()
     if content[:4] == b"glTF":
@@ -121,12 +121,12 @@ def _check_accessors(path: Path, most: int) -> None:
 def _parts(
     path: Path, max_triangles: int, images: dict[tuple[int, bytes], NDArray[np.uint8]]
 ) -> Iterator[tuple[Floats, Floats, Floats, NDArray[np.int32]]]:
-    """Yield the arrays of ``ColouredMesh`` of each geometry that has faces, at each of its nodes; collect the images.
+    """Yield the arrays of ``ColouredMesh`` for each node of each geometry that has faces.
 
     Args:
         path: the file.
         max_triangles: largest number of triangles.
-        images: textures by the id of the file's image and the material's colour.
+        images: textures by the id of the file's image and the material's colour; filled here.
     """
     import trimesh
 
@@ -163,7 +163,7 @@ def _parts(
 
 
 def _material(material: Any) -> tuple[Any, Floats]:
-    """Return the image of a trimesh material, or None, and its colour, sRGB 0 to 1, (3,)."""
+    """Return the image of a trimesh material (None if it has none) and its colour, sRGB 0 to 1, (3,)."""
     if material is None:
         return None, np.full(3, GREY, np.float32)
     image = getattr(material, "baseColorTexture", None)
@@ -178,19 +178,19 @@ def _material(material: Any) -> tuple[Any, Floats]:
 
 
 def _corner_colours(visual: Any, faces: NDArray[np.integer], colour: Floats) -> Floats:
-    """Return the colours of the corners, 0 to 1, (T, 3, 3), from the vertices, the faces, or the material."""
+    """Return the corners' colours, 0 to 1, (T, 3, 3), from the vertices, the faces or the material."""
     kind = getattr(visual, "kind", None)
     if kind == "vertex":
         return _in_shares(visual.vertex_colors)[faces][..., :3]
     if kind == "face":
         return np.repeat(_in_shares(visual.face_colors)[:, None, :3], 3, axis=1)
     attributes = getattr(visual, "vertex_attributes", {})
-    if "color" in attributes:  # of glTF, beside a material
+    if "color" in attributes:  # a glTF file may have vertex colours beside a material
         return _in_shares(attributes["color"])[faces][..., :3]
     return np.tile(colour, (*faces.shape, 1))
 
 
 def _in_shares(colour: Any) -> Floats:
-    """Return colours as shares of 1; integers are of their type's range, as trimesh keeps them."""
+    """Return colours in the range 0 to 1; integers are divided by their type's largest value, as in trimesh."""
     values = np.asarray(colour)
     return (values / np.iinfo(values.dtype).max if values.dtype.kind in "ui" else values).astype(np.float32)

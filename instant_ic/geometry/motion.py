@@ -1,6 +1,6 @@
-"""Motion of a differential drive: the arc of a constant twist, and steps within a limit of acceleration.
+"""Motion of a differential drive: the arc of a constant twist, and steps within an acceleration limit.
 
-Both are plain Python, so that numba kernels can compile them, too (``njit(along_arc)``).
+Both functions are plain Python, so that numba can compile them too (``njit(along_arc)``).
 """
 
 from __future__ import annotations
@@ -14,12 +14,12 @@ def along_arc(
     """Return the pose after a motion of constant twist: the exponential map of SE(2).
 
     Args:
-        x: start in metres.
-        y: start in metres.
+        x: x of the start in metres.
+        y: y of the start in metres.
         yaw: heading at the start in radians.
         forward: distance along the body's x axis in metres; negative is backward.
         turn: change of the heading in radians.
-        sideways: distance along the body's y axis in metres; not zero where tracks slip.
+        sideways: distance along the body's y axis in metres; not zero if the tracks slip.
 
     Returns:
         x and y in metres, and the heading in radians, not wrapped.

@@ -15,7 +15,7 @@ Pose2 = NDArray[np.float64]
 
 
 def rotation_matrix(roll: float = 0.0, pitch: float = 0.0, yaw: float = 0.0) -> Matrix:
-    """Return the rotation about the fixed axes x, y, z in this order (REP-103), radians, (3, 3)."""
+    """Return the rotation matrix (3, 3) about the fixed axes x, y, z in this order (REP-103); angles in radians."""
     cr, sr = math.cos(roll), math.sin(roll)
     cp, sp = math.cos(pitch), math.sin(pitch)
     cy, sy = math.cos(yaw), math.sin(yaw)
@@ -31,7 +31,7 @@ def rotation_matrix(roll: float = 0.0, pitch: float = 0.0, yaw: float = 0.0) -> 
 def pose_matrix(
     x: float = 0.0, y: float = 0.0, z: float = 0.0, roll: float = 0.0, pitch: float = 0.0, yaw: float = 0.0
 ) -> Matrix:
-    """Return the pose from a translation in metres and fixed-axis angles in radians, (4, 4)."""
+    """Return the pose (4, 4) from a translation in metres and fixed-axis angles in radians."""
     matrix = np.eye(4)
     matrix[:3, :3] = rotation_matrix(roll, pitch, yaw)
     matrix[:3, 3] = (x, y, z)
@@ -44,7 +44,7 @@ def matrix_from_quaternion(xyzw: ArrayLike, translation: ArrayLike = (0.0, 0.0, 
     Raises:
         ValueError: the quaternion is zero or not finite.
     """
-    # Plain floats: numpy's overhead on arrays of three or four numbers is ten times the arithmetic.
+    # Plain floats, because numpy's overhead on arrays of three or four numbers is ten times the arithmetic.
     x, y, z, w = np.asarray(xyzw, dtype=np.float64).tolist()
     tx, ty, tz = np.asarray(translation, dtype=np.float64).tolist()
     norm2 = x * x + y * y + z * z + w * w
@@ -68,7 +68,7 @@ def quaternion_from_matrix(matrix: ArrayLike) -> NDArray[np.float64]:
 
 def _quaternion(matrix: NDArray[np.float64]) -> tuple[float, float, float, float]:
     (a, b, c), (d, e, f), (g, h, i) = matrix[:3, :3].tolist()
-    # Divide by the largest of the four squared components: no loss of precision near 180°.
+    # Dividing by the largest of the four squared components keeps the precision near 180°.
     squares = (1 + a - e - i, 1 - a + e - i, 1 - a - e + i, 1 + a + e + i)
     largest = squares.index(max(squares))
     x, y, z, w = (
@@ -126,7 +126,7 @@ def interpolate(matrix0: Matrix, matrix1: Matrix, alpha: float) -> Matrix:
 
 
 def wrap_angle(angle_rad: float) -> float:
-    """Return the same angle in (−π, π]."""
+    """Return the angle wrapped to (−π, π]."""
     wrapped = math.remainder(angle_rad, 2 * math.pi)
     return math.pi if wrapped == -math.pi else wrapped
 
@@ -144,7 +144,7 @@ def matrix_from_pose2(pose: ArrayLike) -> Matrix:
 
 
 def compose2(a: ArrayLike, b: ArrayLike) -> Pose2:
-    """Return the planar composition ``a ∘ b``; ``b`` is in ``a``'s frame, the result in the parent frame of ``a``."""
+    """Return the planar composition ``a ∘ b``: ``b``, given in the frame of ``a``, in the parent frame of ``a``."""
     ax, ay, ayaw = np.asarray(a, dtype=np.float64).tolist()
     bx, by, byaw = np.asarray(b, dtype=np.float64).tolist()
     c, s = math.cos(ayaw), math.sin(ayaw)
@@ -163,10 +163,10 @@ def relative2(a: ArrayLike, b: ArrayLike) -> Pose2:
 
 
 def planar_covariance(covariance: NDArray[np.float64], unmeasured: float = 0.0) -> NDArray[np.float64]:
-    """Return the covariance (6, 6) in the order x y z rx ry rz from one of x, y, yaw (3, 3).
+    """Return the covariance (6, 6) of x, y, z, roll, pitch and yaw from a planar one.
 
     Args:
-        covariance: (3, 3).
+        covariance: covariance of x, y and yaw, (3, 3).
         unmeasured: variance of z, roll and pitch.
     """
     full = np.diag(np.full(6, unmeasured))

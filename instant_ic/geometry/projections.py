@@ -26,12 +26,12 @@ def equirect_directions(width: int, height: int) -> NDArray[np.float32]:
 
 @functools.lru_cache(maxsize=4)
 def rays_of(size: tuple[int, int]) -> NDArray[np.float32]:
-    """Return ``equirect_directions`` of a panorama of (height, width), kept; not to be changed."""
+    """Return the cached ``equirect_directions`` of a panorama of (height, width); the array must not be changed."""
     return equirect_directions(size[1], size[0])
 
 
 def directions_at(azimuth: Floats, elevation: Floats) -> NDArray[np.float32]:
-    """Return the unit directions at all azimuths (W,) of all elevations (H,), radians, (H, W, 3)."""
+    """Return the unit directions (H, W, 3) for all pairs of elevations (H,) and azimuths (W,), in radians."""
     horizontal = np.cos(elevation)[:, None]
     directions = np.empty((len(elevation), len(azimuth), 3), np.float32)
     directions[..., 0] = horizontal * np.cos(azimuth)
@@ -41,7 +41,7 @@ def directions_at(azimuth: Floats, elevation: Floats) -> NDArray[np.float32]:
 
 
 def equirect_pixels(directions: Floats, width: int, height: int) -> tuple[Floats, Floats]:
-    """Return the index coordinates ``(u, v)`` of directions (..., 3) of any length.
+    """Return the pixel coordinates ``(u, v)`` of directions (..., 3) of any length.
 
     ``u`` is in [−0.5, width − 0.5); the sampler must wrap column ``width`` to 0. ``v`` is in [−0.5, height − 0.5].
     """
@@ -78,7 +78,7 @@ def perspective_directions(width: int, height: int, hfov_rad: float) -> NDArray[
 
 
 def sample_equirect(image: NDArray[np.generic], directions: Floats) -> NDArray[np.float32]:
-    """Return the bilinear samples of a panorama (H, W) or (H, W, C) along directions (..., 3); wraps at the seam."""
+    """Sample a panorama (H, W) or (H, W, C) bilinearly along directions (..., 3), across the seam too."""
     height, width = image.shape[:2]
     u, v = equirect_pixels(directions, width, height)
     v = np.clip(v, 0, height - 1)

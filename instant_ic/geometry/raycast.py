@@ -25,7 +25,7 @@ class RayCaster:
             raise ValueError(f"a mesh of at least one triangle is needed (got triangles of shape {triangles.shape})")
         self._scene = EmbreeScene(robust=True)
         self._mesh = TriangleMesh(self._scene, triangles)
-        # The first query commits the scene, which must not happen in two threads at once.
+        # The first query commits the scene, and two threads must not do this at once.
         self._lock = threading.Lock()
         with self._lock:
             self.cast(np.zeros((1, 3), np.float32), np.asarray([[0.0, 0.0, 1.0]], np.float32))

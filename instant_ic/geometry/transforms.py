@@ -12,17 +12,17 @@ from instant_ic.geometry.poses import Matrix, interpolate, inverse
 
 
 class TransformError(LookupError):
-    """No such frame, no path between two frames, or no value at the requested time."""
+    """A frame is unknown, two frames have no path between them, or no value exists at the requested time."""
 
 
 _TOLERANCE_NS = 200_000_000
-"""How far beyond its newest value a look-up may reach; it then returns the newest value. Drivers stamp data a little
-later than the last odometry that arrived."""
+"""Largest time after a frame's newest value at which a look-up still returns that value. Drivers stamp data a little
+later than the last odometry that has arrived."""
 
 
 @dataclass
 class _Edge:
-    """One child frame: its parent, and its poses over time."""
+    """A child frame's parent, and its poses over time."""
 
     parent: str
     static: bool
@@ -31,10 +31,10 @@ class _Edge:
 
 
 class TransformBuffer:
-    """Keeps the last seconds of a tree of frames and returns the pose between any two of them.
+    """The last seconds of a tree of frames, with the pose between any two of them.
 
     Args:
-        cache_s: how much of the past is kept for moving frames.
+        cache_s: time in seconds for which the values of moving frames are kept.
     """
 
     def __init__(self, cache_s: float = 30.0) -> None:
@@ -51,10 +51,11 @@ class TransformBuffer:
         static: bool = False,
         now_ns: int | None = None,
     ) -> None:
-        """Add one value; an existing stamp is replaced, an older one is inserted in order.
+        """Add a value, in the order of stamps; it replaces a value with the same stamp.
 
-        With the present time ``now_ns`` a frame's values are dropped if the newest is ahead of it: the clock was set
-        back. It would count as the newest until the clock has caught up, and the robot would seem to stand.
+        If the frame's newest value is ahead of the present time ``now_ns``, the clock was set back and the frame's
+        values are dropped. Otherwise that value would stay the newest until the clock has caught up, and the robot
+        would seem to stand.
 
         Raises:
             TransformError: the matrix is not a finite (4, 4) array, or a frame would be its own ancestor.
@@ -90,15 +91,15 @@ class TransformBuffer:
                 del edge.stamps_ns[:keep], edge.matrices[:keep]
 
     def forget_moving(self) -> None:
-        """Drop the values of moving frames, for example when time goes back; fixed frames stay."""
+        """Drop the values of moving frames, for example when time goes back. Fixed frames are kept."""
         with self._lock:
             self._edges = {child: edge for child, edge in self._edges.items() if edge.static}
 
     def lookup(self, target: str, source: str, stamp_ns: int | None = None) -> Matrix:
-        """Return ``target_from_source`` at a time, interpolated; without a time, from each frame's newest value.
+        """Return ``target_from_source``, interpolated at ``stamp_ns``; without a time, from each frame's newest value.
 
         Raises:
-            TransformError: unknown frame, no path, or the time is outside the stored range.
+            TransformError: a frame is unknown, there is no path, or the time is outside the stored range.
         """
         with self._lock:
             up_source = self._chain(source)

@@ -6,7 +6,7 @@ import math
 
 
 def clip_twist(linear: float, angular: float, max_linear: float, max_angular: float) -> tuple[float, float]:
-    """Scale a twist as a whole to within two speed limits, which keeps its curvature; zero if it is not finite.
+    """Scale a twist to within two speed limits, keeping its curvature; return zero if it is not finite.
 
     >>> clip_twist(1.0, 0.5, max_linear=0.5, max_angular=1.0)
     (0.5, 0.25)

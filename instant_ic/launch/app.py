@@ -23,8 +23,8 @@ from instant_ic.launch.supervisor import Supervisor
 from instant_ic.util.estop_state import RunMark
 from instant_ic.util.pace import PaceFiles, describe, remove_files
 
-_WAITING_LINES = 2000  # how many lines a terminal may lag behind
-_LAST_LINES_S = 2.0  # how long the end waits for a blocked terminal
+_WAITING_LINES = 2000  # largest number of lines that a terminal may lag behind
+_LAST_LINES_S = 2.0  # longest wait for a blocked terminal at the end
 
 
 def run_stack(
@@ -34,15 +34,15 @@ def run_stack(
     pace: float | None = None,
     verbose: bool = False,
 ) -> int:
-    """Start everything, show its state, and stop it at the end.
+    """Start a launch file's nodes, show their state, and stop them at the end.
 
     Args:
         description: contents of the launch file.
-        run_dir: run directory; created if missing, with those of the groups inside.
-        live: show a table of the nodes below the lines; default: only if standard output is a terminal.
-        pace: the stack's seconds per second of the machine. Default: chosen by the load if the devices are simulated,
+        run_dir: run directory; created if missing, with the groups' run directories inside.
+        live: show a table of the nodes below the lines; by default only if standard output is a terminal.
+        pace: the stack's seconds per second of the machine; by default chosen by the load if the devices are simulated,
             else 1.
-        verbose: show every line of the nodes' output; default: warnings and errors after the start, each once.
+        verbose: show every line of the nodes' output; by default each warning and error after the start once.
 
     Returns:
         Exit status, see :meth:`Supervisor.run`.
@@ -73,7 +73,7 @@ def run_stack(
             elif pace is not None and pace != 1.0:
                 PaceFiles(folders, pace)
                 output.event(f"{describe(pace, adapts=False)}, for simulated devices only")
-            # The health monitor is made once the processes are started, so that they need not wait for it.
+            # The health monitor is made after the processes are started, so that they need not wait for it.
             make_health = functools.partial(HealthMonitor, description.nodes, run_dir)
             status = Supervisor(description.nodes, run_dir, output, make_health=make_health).run()
         finally:
@@ -84,10 +84,10 @@ def run_stack(
 
 
 class StackOutput:
-    """The screen, on a thread of its own.
+    """The launcher's screen, on a thread of its own.
 
-    A terminal stopped with Ctrl-S or a dead ssh connection must not hold up the threads that read the nodes' pipes, or
-    the nodes would block at their next line.
+    A terminal that is stopped with Ctrl-S, or a dead ssh connection, must not block the threads that read the nodes'
+    pipes, or the nodes would block at their next line.
     """
 
     def __init__(self, labels: Sequence[str], live: bool, verbose: bool) -> None:
@@ -98,7 +98,7 @@ class StackOutput:
         self._view = self._printer.submit(self._screen.start)
 
     def node_line(self, node: str, text: str) -> None:
-        """Show a line of a node, unless the terminal lags too far behind; the log has it."""
+        """Show a line of a node, unless the terminal lags too far behind; the line is in the log anyway."""
         if self._room.acquire(blocking=False):
             self._printer.submit(self._screen.node_line, node, text).add_done_callback(lambda _: self._room.release())
 
@@ -107,7 +107,7 @@ class StackOutput:
         self._printer.submit(self._screen.event, text, bad)
 
     def refresh(self, processes: Sequence[ManagedProcess], health: HealthMonitor | None, ending: bool) -> None:
-        """Adapt the pace, and show the present state, unless the last one waits for the terminal still."""
+        """Adapt the pace and show the present state, unless the previous state still waits for the terminal."""
         if self.pacing is not None and health is not None and not ending:
             self.pacing.step(health)
         view = stack_view(processes, health, ending, self.pacing.text if self.pacing is not None else "")
@@ -122,10 +122,10 @@ class StackOutput:
         try:
             self._printer.submit(self._screen.stop).result(_LAST_LINES_S)
         except TimeoutError:
-            # The blocked thread holds standard output, and the interpreter would wait for it forever. The nodes have
-            # ended and the logs are written.
+            # The blocked thread holds standard output, and the interpreter would wait for it forever. By now the nodes
+            # have ended and the logs are written.
             os._exit(status)
-        except OSError:  # ic launch ... | head: the rest of the buffer has no destination
+        except OSError:  # as in ic launch ... | head: the reader is gone
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         self._printer.shutdown()
 
@@ -141,14 +141,14 @@ def stack_view(
     if not ending:
         down = (ProcessState.FAILED, ProcessState.WAITING)
         health.publish({p.spec.label: p.state.value for p in processes if p.state in down}, faults)
-    # Nothing waits for an optional node that has ended: a recorder whose disk is full.
+    # The start does not wait for an optional node that has ended, such as a recorder whose disk is full.
     over = (ProcessState.FAILED, ProcessState.ENDED)
     gone = {p.spec.label for p in processes if p.state in over and not p.spec.respawn}
     return StackView(
         rows=tuple(node_row(process, health, faults) for process in processes),
         missing=tuple(label for label in health.nodes_missing() if label not in gone),
         waiting=tuple(health.waiting_for()),
-        # Only a terminal gets the token: others may read the file or pipe that standard output goes to.
+        # Only a terminal gets the token, because other users may read a file or pipe.
         addresses=dict(health.addresses(with_token=sys.stdout.isatty())),
         faults=tuple(f"{fault.topic} of {fault.label}: {fault.text}" for fault in faults),
         ending=ending,

@@ -1,8 +1,8 @@
 """Start a program that the kernel kills when its launcher dies; run as a script, never imported.
 
 ``python -I -S child.py LAUNCHER_PID PROGRAM ARGUMENTS...``. The death signal survives the exec, so the program itself
-needs no support for it. It is set here, not between fork and exec, because the launcher has threads. SIGKILL is safe:
-if the process that holds the crawler is killed, the base's own command time-out stops the tracks.
+needs no support for it. The signal is set here, not between fork and exec, because the launcher has threads. SIGKILL is
+safe even for the process that drives the crawler, because the base's own command time-out then stops the tracks.
 """
 
 import ctypes

@@ -1,4 +1,4 @@
-"""Contents of a launch file after reading and checking (docs/launch.md lists its keys)."""
+"""Contents of a launch file after reading and checking. docs/launch.md lists its keys."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from instant_ic.config.yaml_place import YamlProblem
 from instant_ic.util import paths
 
 HANG_TIMEOUT_S = 10.0
-"""Default hang time-out: a node without a heartbeat for longer than this counts as hung."""
+"""Default time-out after which a node without a heartbeat counts as hung."""
 
 
 class LaunchFileError(ValueError):
@@ -46,14 +46,14 @@ class NodeSpec:
         exec: name of a shipped node, or the path of a program.
         command: the whole command line, without the run directory.
         env: environment variables to add.
-        respawn: restart it when it ends.
-        respawn_delay_s: wait before the first restart; doubles with each further one within the window.
-        required: true if the stack ends with it.
-        file: the launch file that contains it.
-        line: its line there.
-        run_dir: its run directory; None: the stack's own.
-        group: name of that run directory within the stack's, shown before the node's name; else empty.
-        hang_timeout_s: without a heartbeat for longer than this it counts as hung; 0: never.
+        respawn: restart the node when it ends.
+        respawn_delay_s: wait before the first restart; doubles with each further restart within the window.
+        required: true if the stack ends with this node.
+        file: the launch file that contains the node.
+        line: line of the node in that file.
+        run_dir: run directory of the node; None: the stack's own.
+        group: name of that run directory within the stack's, shown before the node's name; empty for the stack's own.
+        hang_timeout_s: time without a heartbeat after which the node counts as hung; 0: never.
         places: ``file:line`` of each ``-p`` argument of the command.
     """
 
@@ -79,14 +79,14 @@ class NodeSpec:
 
 @dataclass(frozen=True)
 class LaunchDescription:
-    """Everything that a launch file starts, with its arguments applied."""
+    """All nodes that a launch file starts, with its arguments applied."""
 
     file: Path
     nodes: tuple[NodeSpec, ...]
 
     @property
     def simulated(self) -> bool:
-        """True if the devices are simulated, so that the stack's time need not be the machine's."""
+        """True if the devices are simulated, so that the stack's time may run slower than the machine's."""
         return any(node.exec == "simulator" for node in self.nodes)
 
     def run_dirs(self, run_dir: Path) -> list[Path]:
@@ -99,7 +99,7 @@ def find_launch_file(name: str) -> Path:
     """Find a launch file by path, or by the name of a shipped one (``sim`` or ``sim.yaml``).
 
     Raises:
-        FileNotFoundError: neither exists; the message lists the shipped ones.
+        FileNotFoundError: neither exists.
     """
     path = Path(name)
     if paths.is_file(path):

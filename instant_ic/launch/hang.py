@@ -1,4 +1,4 @@
-"""Detection of nodes that hang: time without a heartbeat, and whether the node computes meanwhile."""
+"""Detection of hung nodes, by the time without a heartbeat and by whether the node computes meanwhile."""
 
 from __future__ import annotations
 
@@ -6,14 +6,14 @@ from collections.abc import Callable
 from pathlib import Path
 
 BUSY_FACTOR = 6.0
-"""Factor on the hang time-out for a node that computes (a compiler at its first image)."""
+"""Factor on the hang time-out of a node that computes, for example one that compiles kernels at its first image."""
 
 _BUSY_SHARE = 0.5
 _LONGEST_LOOK_S = 0.5
 
 
 def active_seconds(pid: int) -> float:
-    """Return the seconds that a process's first thread has computed or waited for a CPU; 0 if it is gone."""
+    """Return the seconds for which a process's first thread has computed or waited for a CPU; 0 if it has ended."""
     try:
         computed, waited, _ = Path(f"/proc/{pid}/schedstat").read_text().split()
     except OSError:
@@ -25,7 +25,7 @@ class HeartbeatSilence:
     """Time that a process has gone without a heartbeat, as observed by the launcher.
 
     Args:
-        active_s: returns the CPU time of a process.
+        active_s: function that returns ``active_seconds`` of a process.
     """
 
     def __init__(self, active_s: Callable[[int], float] = active_seconds) -> None:
@@ -33,22 +33,22 @@ class HeartbeatSilence:
         """Time of the newest heartbeat; None before the first."""
         self.lasts_s = 0.0
         self.reported = False
-        """True once the operator knows of this silence."""
+        """True once this silence has been reported to the operator."""
         self._active_s = active_s
         self._active_before_s = 0.0
 
     def look(self, beat_s: float | None, pid: int, since_last_look_s: float) -> None:
-        """Take the time of the newest heartbeat."""
+        """Record the time of the newest heartbeat, and update the length of the silence."""
         if beat_s is None or beat_s != self.beat_s:
             self.beat_s, self.lasts_s, self.reported = beat_s, 0.0, False
             self._active_before_s = self._active_s(pid)
             return
-        # If the launcher itself was held up (stopped, swapped out), the nodes are not to blame.
+        # A pause of the launcher itself (stopped, swapped out) must not count as silence of the nodes.
         self.lasts_s += min(since_last_look_s, _LONGEST_LOOK_S)
 
     def busy(self, pid: int) -> bool:
         """Return whether the process has computed, or waited for a CPU, for most of the silence."""
-        # The kernel counts a wait only at its end.
+        # A process that waits for a CPU now is busy too: the kernel counts a wait only when it ends.
         return _is_runnable(pid) or self._active_s(pid) - self._active_before_s > _BUSY_SHARE * self.lasts_s
 
 

@@ -1,4 +1,4 @@
-"""The launcher's view of the nodes' health: heartbeats, topic rates, and what is still missing at start-up."""
+"""The nodes' health as the launcher sees it: heartbeats, topic rates, and the steps still missing at start-up."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ if TYPE_CHECKING:
     from instant_ic.launch.description import NodeSpec
 
 FAULT_HOLDS_S = 3.0
-"""A wrong rate is reported once it has lasted this long."""
+"""Time for which a rate must be wrong before it is reported."""
 
 _VSPACE_READY = 2
 _DIAGNOSTICS_S = 1.0
 
 LATE = "/simulation/late"
-"""Topic of the node ``simulator``."""
+"""Topic on which the node ``simulator`` reports its delay."""
 
 MILESTONES: tuple[tuple[str, str, str], ...] = (
     ("camera's first image", "theta_camera", "/camera/image/compressed"),
@@ -41,7 +41,7 @@ MILESTONES: tuple[tuple[str, str, str], ...] = (
     ("map", "grid_slam", "/pose"),  # the map itself is published only when it changes
     ("first depth image", "depth_scaler", "/depth/scaled"),
 )
-"""Steps of the start that an operator waits for: label, node, and the topic whose messages show that it works."""
+"""Steps of the start-up that an operator waits for: label, node, and the topic whose first message completes it."""
 
 
 @dataclass(frozen=True)
@@ -61,11 +61,11 @@ class TopicFault:
 
 
 class HealthMonitor:
-    """Subscribes to ``/heartbeat`` (and ``/vspace/status`` if the stack has a ``nerf``) without a node of its own.
+    """A monitor of ``/heartbeat`` (and of ``/vspace/status`` if the stack has a ``nerf``) without a node of its own.
 
     Args:
         nodes: the stack's nodes.
-        run_dir: prepared run directory; those of groups lie in it, also prepared.
+        run_dir: prepared run directory, which contains the prepared run directories of the groups.
     """
 
     def __init__(self, nodes: Sequence[NodeSpec], run_dir: Path) -> None:
@@ -111,7 +111,7 @@ class HealthMonitor:
         for group, subscription in self._beats:
             for publisher, message in _arrived(subscription):
                 beat = from_message(message)
-                if beat.node == publisher:  # a bridge's may come from a node of this name on another machine
+                if beat.node == publisher:  # else a bridge forwards the heartbeat of a node on another machine
                     self.nodes[f"{group}/{beat.node}" if group else beat.node] = beat
         for label, subscription in self._vspace:
             for _, status in _arrived(subscription):
@@ -134,14 +134,14 @@ class HealthMonitor:
 
     @property
     def cpu_cores(self) -> float:
-        """Cores that the nodes use, by their newest heartbeats."""
+        """Number of cores that the nodes use, by their newest heartbeats."""
         return sum(health.cpu_percent for health in self.nodes.values()) / 100.0
 
     def take_late(self) -> tuple[float | None, bool]:
         """Return the largest delay of the simulated devices since the last call, and whether a source is stale.
 
-        The delay is a share of the acceptable one; None without a report. The arbiter reports stale sources. Both are
-        known only with a simulator in the stack.
+        The delay is a share of the acceptable delay; None without a report. Stale sources are reported by the arbiter.
+        Both are known only with a simulator in the stack.
         """
         late = max((float(message.data) for sub in self._late for _, message in _arrived(sub)), default=None)
         reasons = [message.reason_code for sub in self._control for _, message in _arrived(sub)]
@@ -153,7 +153,7 @@ class HealthMonitor:
         return health.seen_s if health is not None and health.pid == pid and health.up else None
 
     def nodes_missing(self) -> list[str]:
-        """Return the nodes that have not reported yet that they run."""
+        """Return the nodes that have not yet reported that they run."""
         return [s.label for s in self._specs if s.label not in self.nodes or not self.nodes[s.label].up]
 
     def waiting_for(self) -> list[str]:
@@ -166,7 +166,7 @@ class HealthMonitor:
         return left
 
     def topic_faults(self) -> list[TopicFault]:
-        """Return topics that have stopped or become too slow (config/topics.yaml), once the fault has lasted a while.
+        """Return the topics that have stopped or become too slow for ``FAULT_HOLDS_S``, by config/topics.yaml.
 
         Topics that never had a message are left to :meth:`waiting_for` and to the node's own diagnoses.
         """
@@ -193,7 +193,7 @@ class HealthMonitor:
         """Publish ``/diagnostics`` once a second.
 
         Args:
-            down: label → text, for nodes that should run and do not.
+            down: label → text, for nodes that should run but do not.
             faults: see :meth:`topic_faults`.
         """
         now_s = time.monotonic()
@@ -218,7 +218,7 @@ class HealthMonitor:
         """Return the addresses of the operator's page and, if it needs a token, of the Foxglove bridge, once they run.
 
         Args:
-            with_token: include the token, which changes with each start; for a terminal. Else name its file.
+            with_token: include the token, which changes with each start; only for a terminal. False: name its file.
         """
         for spec in self._specs:
             health = self.nodes.get(spec.label)
@@ -227,12 +227,12 @@ class HealthMonitor:
             folder = self._folders[spec.group]
             file = sign_in_file(folder, spec.name)
             if with_token and file.is_file():
-                with suppress(OSError):  # its node has just ended
+                with suppress(OSError):  # the node has just ended and removed its file
                     self._addresses[spec.label] = file.read_text(encoding="utf-8").strip()
             elif spec.label not in self._addresses:
                 address = next((console_address(n) for n in registry.list_nodes(folder) if n.name == spec.name), "")
                 if file.is_file():
-                    address = f"{address or spec.exec}, sign in as {file} says"
+                    address = f"{address or spec.exec}, sign in with the link in {file}"
                 if address:
                     self._addresses[spec.label] = address
         return self._addresses
@@ -244,9 +244,9 @@ class HealthMonitor:
 
 
 def _arrived(subscription: RawSubscription) -> Iterator[tuple[str, Any]]:
-    """Yield publisher and message of what has arrived. A message that cannot be read must not end the stack."""
+    """Yield publisher and content of the messages that have arrived, except those that cannot be read."""
     for received in subscription.take():
-        with suppress(MessageError):  # its node counts as silent
+        with suppress(MessageError):  # must not end the stack; the node then counts as silent
             yield received.publisher, deserialize(received.payload, received.type_name)
 
 
@@ -255,9 +255,9 @@ def _labelled(spec: NodeSpec, text: str) -> str:
 
 
 def console_address(node: registry.NodeInfo) -> str:
-    """Return the address of a console by its parameters ``server.host`` and ``server.port``; empty if it has none."""
+    """Return the address of a console by its parameters ``server.host`` and ``server.port``; empty if unknown."""
     server = node.params.get("server", {})
-    if not server.get("port"):  # any free port: the console's log has it
+    if not server.get("port"):  # 0 is any free port; the console logs the one it got
         return ""
     host = str(server.get("host") or "127.0.0.1")
     scheme = "https" if server.get("access", {}).get("tls_certificate") else "http"

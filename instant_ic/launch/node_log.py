@@ -14,12 +14,12 @@ from instant_ic.util.private import make_folder, open_file
 
 
 class NodeLog:
-    """A node's log file, mode 0600; the previous run's file is kept. Errors are reported once and never raised.
+    """A node's log file, mode 0600. The previous run's file is kept. Errors are reported once and never raised.
 
     Args:
         path: the log file.
-        report: called with a text when writing fails; runs on the writing thread.
-        max_bytes: a larger file is renamed to ``.log.1``, and a new one is started.
+        report: function called with a text when writing fails, on the writing thread.
+        max_bytes: size above which the file is renamed to ``.log.1`` and a new one is started.
     """
 
     def __init__(self, path: Path, report: Callable[[str], None], max_bytes: int = 64 << 20) -> None:
@@ -53,11 +53,11 @@ class NodeLog:
         except OSError as error:
             self.close()
             if not self._failed:
-                self._report(f"{self.path} cannot be written ({error.strerror}). Free some space; its lines are lost.")
+                self._report(f"{self.path} cannot be written ({error.strerror}). Lines are lost; free some space.")
             self._failed = True
 
     def close(self) -> None:
-        """Close the file; a later write opens it again."""
+        """Close the file. A later write opens it again."""
         with self._lock:
             if self._file is not None:
                 file, self._file = self._file, None

@@ -1,10 +1,10 @@
 """Run a node's file as a program, and exit at once when the node ends: ``node_main.py FILE ARGUMENTS``.
 
-Run as a script, never imported, so that no node loads any of the launcher.
+This file is run as a script and never imported, so that nodes load nothing of the launcher.
 
-Interpreter shutdown with numba's compiler loaded takes 0.7 s of CPU; for six nodes on two cores that is several
-seconds. A node has closed what matters (motors, bag, sockets, registry) before its ``main`` returns; the rest is
-memory. Until the node has installed its own signal handlers, a signal ends the process quietly: nothing is open yet.
+Interpreter shutdown with numba's compiler loaded takes 0.7 s of CPU, several seconds for six nodes on two cores. It can
+be skipped, because a node closes its motors, bag, sockets and registry before its ``main`` returns. Until the node has
+installed its own signal handlers, a signal ends the process quietly: nothing is open yet.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ import traceback  # noqa: E402
 from pathlib import Path  # noqa: E402
 
 _here = Path(__file__).resolve().parent
-if sys.path and Path(sys.path[0]) == _here:  # the modules beside this file must not shadow a node's imports
+if sys.path and Path(sys.path[0]) == _here:  # modules beside this file must not shadow a node's imports
     sys.path[0] = str(_here.parents[1])
 
 
@@ -38,7 +38,7 @@ def main() -> None:
             status = end.code or 0
         else:
             sys.stderr.write(f"{end.code}\n")
-    except BaseException:  # noqa: BLE001 - the process ends here, so print what the interpreter would print
+    except BaseException:  # noqa: BLE001 - the process ends here, so print the traceback as the interpreter would
         traceback.print_exc()
     logging.shutdown()
     sys.stdout.flush()

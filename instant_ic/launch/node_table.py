@@ -22,7 +22,7 @@ STATE_STYLES = {
     "stopping": ("◌", "dim"),
     "ended": ("○", "dim"),
 }
-"""Sign and style of the states that are no fault."""
+"""Sign and style of the states that are not a fault."""
 _FAULT_STYLE = ("●", "bold red")
 
 
@@ -32,8 +32,8 @@ class TopicRow:
 
     Attributes:
         age_s: time since the newest message; inf before the first.
-        nominal_hz: expected rate; None where unknown.
-        fault: text of the fault; empty where there is none.
+        nominal_hz: expected rate; None if unknown.
+        fault: text of the fault; empty if there is none.
     """
 
     topic: str
@@ -44,7 +44,7 @@ class TopicRow:
 
     @property
     def rate(self) -> str:
-        """Measured and nominal rate as text: ``9.8/10``, ``9.8``, or ``-`` where the rate is zero."""
+        """Measured and nominal rate as text: ``9.8/10``, ``9.8``, or ``-`` if the rate is zero."""
         measured = f"{self.rate_hz:.0f}" if self.rate_hz >= 19.5 else f"{self.rate_hz:.1f}" if self.rate_hz > 0 else "-"
         return measured if self.nominal_hz is None else f"{measured}/{self.nominal_hz:g}"
 
@@ -54,13 +54,13 @@ class NodeRow:
     """One node.
 
     Attributes:
-        state: its state, in one or two words.
-        message: its worst diagnosis, else the faults of its topics; empty when all is well.
+        state: state in one or two words.
+        message: worst diagnosis of the node, else the faults of its topics; empty if there is neither.
         cpu_percent: CPU time, in percent of one core; nan if unknown.
         rss_mb: resident memory; nan if unknown.
         restarts: number of restarts by the launcher.
-        lost: messages that it has lost.
-        outputs: its active topics, faulty ones first.
+        lost: number of messages that the node has lost.
+        outputs: active topics of the node, faulty ones first.
     """
 
     node: str
@@ -74,7 +74,7 @@ class NodeRow:
 
 
 def heartbeat_row(label: str, beat: Heartbeat, restarts: int = 0) -> NodeRow:
-    """Return a node's row by its newest heartbeat."""
+    """Return a node's row, from its newest heartbeat."""
     state, lost = "silent" if beat.silent else beat.state, sum(beat.lost.values())
     row = NodeRow(label, state, beat.message, beat.cpu_percent, beat.rss_mb, restarts, lost)
     row.outputs = topic_rows(beat.outputs)
@@ -84,7 +84,7 @@ def heartbeat_row(label: str, beat: Heartbeat, restarts: int = 0) -> NodeRow:
 def topic_rows(flows: Mapping[str, Flow]) -> list[TopicRow]:
     """Return the topics of a heartbeat that flow or should flow.
 
-    Faulty topics are first, then those with a nominal rate: the least important ones may not fit into a line.
+    Faulty topics come first, then those with a nominal rate, because the last ones may not fit into a line.
     """
     rows = []
     for topic, flow in flows.items():
@@ -101,10 +101,10 @@ def node_table(rows: Iterable[NodeRow], colours: Mapping[str, str] | None = None
 
     Args:
         rows: the nodes.
-        colours: colours of their names; default: none.
+        colours: colours of the nodes' names; default: none.
     """
     table = Table(box=None, pad_edge=False, header_style="dim")
-    # Minimum widths, or a long message in the last column would squeeze the others.
+    # Minimum widths keep a long message in the last column from squeezing the others.
     for name, width in (("node", 6), ("state", 10), ("CPU %", 5), ("MB", 5), ("lost", 4)):
         table.add_column(name, justify="left" if width > 5 else "right", no_wrap=True, min_width=width)
     table.add_column("sends, Hz", no_wrap=True, overflow="ellipsis")

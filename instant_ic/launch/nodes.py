@@ -24,7 +24,7 @@ NODE_NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
 
 NODE_MAIN = Path(__file__).with_name("node_main.py")
 CONDITION = ("if", "unless")
-"""Keys of entries that may be left out."""
+"""Keys that decide whether an entry counts."""
 _NODE_KEYS = (
     *("exec", "name", "param", "remap", "env", *CONDITION),
     *("respawn", "respawn_delay", "required", "hang_timeout"),
@@ -39,7 +39,7 @@ class Scope:
         file: the launch file.
         run_dir: run directory of the stack, or of its group.
         variables: values of the arguments and ``let`` entries in scope.
-        group: name of its run directory within the stack's; empty: the stack's own.
+        group: name of the group's run directory within the stack's; empty: the stack's own.
         options: ``--params-file`` arguments for each node.
     """
 
@@ -54,18 +54,18 @@ class Scope:
         return dataclasses.replace(self, variables=dict(self.variables), options=list(self.options))
 
     def text(self, value: YamlPlace | None) -> str:
-        """Return a value's text after substitution; empty if there is none."""
+        """Return a value's text after substitution; empty without a value."""
         return "" if value is None else self.substituted(value.text(), value)
 
     def substituted(self, text: str, value: YamlPlace) -> str:
-        """Return a text of this place after substitution."""
+        """Return ``text`` after substitution; errors name the place of ``value``."""
         try:
             return substitute(text, self.variables, self.run_dir)
         except SubstitutionError as error:
             raise value.problem(str(error)) from None
 
     def flag(self, value: YamlPlace | None) -> bool:
-        """Return a truth value; false if there is none."""
+        """Return a truth value; false without a value."""
         try:
             return truth(self.text(value))
         except SubstitutionError as error:
@@ -73,7 +73,7 @@ class Scope:
             raise value.problem(str(error)) from None
 
     def holds(self, fields: Mapping[str, YamlPlace]) -> bool:
-        """Return whether ``if`` and ``unless`` let an entry count."""
+        """Return whether the entry's ``if`` and ``unless`` hold."""
         return ("if" not in fields or self.flag(fields["if"])) and not self.flag(fields.get("unless"))
 
     def seconds(self, value: YamlPlace | None, default: float) -> float:
@@ -90,7 +90,7 @@ class Scope:
         return number
 
     def pairs(self, value: YamlPlace | None, first: str, second: str) -> list[tuple[str, str]]:
-        """Return the two texts of each entry of a list."""
+        """Return the texts of the keys ``first`` and ``second`` of each entry of a list."""
         found = [] if value is None else [entry.fields((first, second), (first, second)) for entry in value.items()]
         return [(self.text(fields[first]), self.text(fields[second])) for fields in found]
 
@@ -99,7 +99,7 @@ def read_node(body: YamlPlace, scope: Scope) -> NodeSpec | None:
     """Read a ``node``; None if its conditions do not hold.
 
     Raises:
-        YamlProblem: the first mistake in it.
+        YamlProblem: the first mistake in the entry.
     """
     fields = body.fields(_NODE_KEYS, required=("exec",))
     executable = scope.text(fields["exec"])
@@ -151,7 +151,7 @@ def _program(value: YamlPlace, executable: str, launch_file: Path) -> tuple[str,
 
 
 def _parameter(entry: YamlPlace, scope: Scope, places: dict[str, str]) -> list[str]:
-    """Return the arguments for one entry of ``param``; note in ``places`` where a single parameter is set."""
+    """Return the arguments for one entry of ``param``; record in ``places`` the line that sets a single parameter."""
     fields = entry.fields(("name", "value", "type", "from", *CONDITION))
     if not scope.holds(fields):
         return []
@@ -175,13 +175,13 @@ _READERS: dict[str, Callable[[str], object]] = {
 
 
 def _parameter_value(value: YamlPlace, kind: str, scope: Scope) -> object:
-    """Return a parameter's value of the given type, or with the spelling of its unquoted scalars."""
+    """Return a parameter's value as the type ``kind``; without one, as YAML reads it."""
     if not value.is_single:
         return _texts_replaced(value, scope)
     text = scope.text(value)
     if kind not in _READERS:
         raise value.problem(f"unknown type {kind!r} (types: str, int, float, bool)")
-    # Quoted and empty text stays text; everything else is read as YAML.
+    # Quoted text and empty text stay text; everything else is read as YAML.
     if kind == "" and ((value.is_quoted and "$(" not in value.text()) or not text):
         return text
     try:
@@ -191,7 +191,7 @@ def _parameter_value(value: YamlPlace, kind: str, scope: Scope) -> object:
 
 
 def _texts_replaced(value: YamlPlace, scope: Scope) -> object:
-    """Return a list or mapping with its texts after substitution."""
+    """Return a list or mapping with all its texts after substitution."""
 
     def read(plain: object) -> object:
         if isinstance(plain, (str, Scalar)) and not is_null(plain):

@@ -1,4 +1,4 @@
-"""Choice of the pace of a simulated stack (:mod:`instant_ic.util.pace`) by what the machine can do."""
+"""Choice of a simulated stack's pace (:mod:`instant_ic.util.pace`) by the speed and load of the machine."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from instant_ic.util.pace import PaceFiles, describe
 _ENOUGH_PER_S = 50e6
 """Iterations of an empty loop per second on the kind of core that ``_NEEDED_CORES`` counts."""
 _NEEDED_CORES = 1.2
-"""Cores that a whole stack needs in real time while it drives, with some margin."""
+"""Number of cores that a whole stack needs in real time while it drives, with some margin."""
 _MEASURE_S = 0.03
 _PERIOD_S = 0.25
 
@@ -29,11 +29,11 @@ class PaceSample:
 
     Attributes:
         now_s: the machine's steady clock.
-        late: largest delay of the simulated devices since the last sample, as a share of the acceptable delay; None: no
-            report has arrived since then.
-        stale: true while the arbiter waits for a source that had been fresh.
-        idle_cores: cores that nothing used since the last sample.
-        stack_cores: cores that the stack used.
+        late: largest delay of the simulated devices since the last sample, as a share of the acceptable delay; None if
+            no report has arrived since then.
+        stale: true while the arbiter waits for a source that was fresh before.
+        idle_cores: mean number of unused cores since the last sample.
+        stack_cores: mean number of cores that the stack used.
     """
 
     now_s: float
@@ -44,7 +44,7 @@ class PaceSample:
 
 
 class PaceChooser:
-    """Samples in, pace out: falls at once when the stack is late, rises in small steps while it is punctual.
+    """Control of the pace: it falls at once when the stack is late, and rises in small steps while it is punctual.
 
     After a fall the pace is held. Each fall that follows soon after a rise doubles the next hold, so that a constant
     load leads to a constant pace.
@@ -55,29 +55,29 @@ class PaceChooser:
     RISE_S = 1.0
     """Time between two rises while cores are idle."""
     PROBE_S = 4.0
-    """Time between two rises while no core is idle: only a try shows whether the stack would stay punctual."""
+    """Time between two rises while no core is idle; then only a trial shows whether the stack stays punctual."""
     PUNCTUAL = 0.5
     """Largest share of the acceptable delay at which the pace may rise."""
     SILENCE_S = 1.0
-    """Longest time without a report while the stack counts as punctual, in the stack's seconds."""
+    """Longest time without a report, in the stack's seconds, for which the stack counts as punctual."""
     HOLD_S, LONGEST_HOLD_S = 3.0, 120.0
     AGAIN_S = 30.0
-    """A fall within this time after a hold, doubled, means that the last rise was too much."""
+    """A fall within this time plus twice the last hold means that the last rise was too much."""
     OTHERS_CORES = 0.5
-    """When other processes use so much less than at the fall, the cause of the fall is gone."""
+    """If other processes use this many cores less than at the fall, the cause of the fall is gone."""
     FAULT_S = 3.0
-    """A source that is stale for longer has a fault that no pace cures."""
+    """A source that is stale for longer has a fault that a lower pace does not cure."""
     BUSY_CORES = 0.3
-    """With more idle cores than this a stale source is not the machine's fault."""
+    """With more idle cores than this, a stale source is not caused by the machine's load."""
 
     def __init__(self, pace: float) -> None:
         self.pace = min(1.0, max(SLOWEST, pace))
         self._hold_s = 0.0
         self._fell_s = self._changed_s = -math.inf
-        self._punctual_s: float | None = None  # since when
+        self._punctual_s: float | None = None  # time since which the stack has been punctual
         self._heard_s = -math.inf
-        self._available_cores = math.inf  # at the last fall
-        self._fresh_s = -math.inf  # when no source was stale last
+        self._available_cores = math.inf  # idle cores and those of the stack at the last fall
+        self._fresh_s = -math.inf  # last time at which no source was stale
 
     def step(self, sample: PaceSample) -> float:
         now_s = sample.now_s
@@ -99,10 +99,10 @@ class PaceChooser:
 
     def _fall(self, sample: PaceSample, late: float) -> None:
         now_s = sample.now_s
-        # The effect of a fall shows in the next images, which come later the slower the pace is.
+        # The effect of a fall shows only in the next images, and a slower pace delays these.
         if self.pace <= SLOWEST or now_s - self._fell_s < 0.25 + 0.4 / self.pace:
             return
-        if self._changed_s > self._fell_s or not self._hold_s:  # it has risen; else this is one fall in several steps
+        if self._changed_s > self._fell_s or not self._hold_s:  # risen since; else this continues the last fall
             again = now_s - self._fell_s < 2.0 * self._hold_s + self.AGAIN_S
             self._hold_s = min(2.0 * self._hold_s, self.LONGEST_HOLD_S) if again else self.HOLD_S
         self._fell_s = self._changed_s = now_s
@@ -113,7 +113,7 @@ class PaceChooser:
         now_s = sample.now_s
         if sample.idle_cores + sample.stack_cores > self._available_cores + self.OTHERS_CORES:
             self._hold_s = min(self._hold_s, self.HOLD_S)
-        free = self.pace * 0.7 * sample.idle_cores / max(sample.stack_cores, 0.1)  # rise that the idle cores allow
+        free = self.pace * 0.7 * sample.idle_cores / max(sample.stack_cores, 0.1)  # rise for which idle cores suffice
         wait_s = self.RISE_S if free >= self.STEP else self.PROBE_S
         since_s = max(self._changed_s, punctual_s, self._fell_s + self._hold_s - wait_s)
         if self.pace < 1.0 and now_s - since_s >= wait_s:
@@ -122,7 +122,7 @@ class PaceChooser:
 
 
 def machine_pace() -> float:
-    """Return the pace that this machine could hold now, from its cores, their speed and their load; takes 30 ms."""
+    """Measure the pace that this machine can hold now, by its cores, their speed and their load; takes 30 ms."""
     began_s, count = time.thread_time(), 0
     while (cpu_s := time.thread_time() - began_s) < _MEASURE_S:
         for _ in range(10_000):
@@ -132,11 +132,11 @@ def machine_pace() -> float:
 
 
 def pace_of(cores: int, loops_per_s: float, load: float) -> float:
-    """Return the pace that a stack could hold beside other processes.
+    """Return the pace that a stack can hold beside other processes.
 
     Args:
         cores: number of cores.
-        loops_per_s: iterations of an empty loop on one of them.
+        loops_per_s: iterations of an empty loop per second on one core.
         load: mean number of processes that already run.
     """
     share = cores / (1.0 + load / cores)
@@ -150,7 +150,7 @@ def idle_cores() -> float:
 
 
 class Pacing:
-    """Adapts the pace of a running stack, and reports changes that an operator notices."""
+    """Adaptation of a running stack's pace, with reports of changes that an operator notices."""
 
     REPORT_STEP = 0.1
     REPORT_S = 10.0

@@ -1,6 +1,6 @@
 """Check the parameters of a launch description's nodes without starting them.
 
-The check imports the nodes' modules, so ``ic launch`` runs it in a forked process, whose memory is free when it ends.
+The check imports the nodes' modules, so ``ic launch`` runs it in a forked process that frees the memory when it ends.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ CHECK_TIMEOUT_S = 120.0
 
 
 class ParameterCheckError(RuntimeError):
-    """The check itself did not finish; the message says why."""
+    """The check did not finish; the message says why."""
 
 
 def given_values(spec: NodeSpec) -> tuple[type[Any], Values]:
@@ -49,7 +49,7 @@ def given_values(spec: NodeSpec) -> tuple[type[Any], Values]:
     Raises:
         ParameterError: a file or an argument cannot be read.
         NodeFileError: the node's module cannot be used.
-        SystemExit: its arguments cannot be read.
+        SystemExit: the node's arguments cannot be read.
     """
     from instant_ic.bus.node_files import node_class
     from instant_ic.bus.process import argument_parser, parse_remaps
@@ -61,7 +61,7 @@ def given_values(spec: NodeSpec) -> tuple[type[Any], Values]:
 
 
 def check_parameters(nodes: Sequence[NodeSpec]) -> list[str]:
-    """Return all unknown parameters, wrong types, values out of range, and values that contradict each other.
+    """Return a text for each unknown parameter, wrong type, value out of range, and contradiction between values.
 
     Programs given by path are not checked.
     """
@@ -72,7 +72,7 @@ def check_parameters(nodes: Sequence[NodeSpec]) -> list[str]:
     for spec in shipped:
         config, values, refused = _configured(spec)
         problems += refused
-        if len(shipped) == len(nodes):  # else a shared value that no node has may be for a program
+        if len(shipped) == len(nodes):  # else an unknown shared value may be meant for a program
             problems += _declared_by_none(spec, values)
         if config is None:
             continue
@@ -110,7 +110,7 @@ def check_parameters_apart(nodes: Sequence[NodeSpec]) -> list[str]:
         process.join()
     raise ParameterCheckError(
         f"the nodes' parameters could not be checked within {CHECK_TIMEOUT_S:.0f} s: is a module waiting for something "
-        "while it is imported? ic launch FILE --no-check starts without"
+        "while it is imported? ic launch FILE --no-check starts without the check"
     )
 
 
@@ -120,7 +120,7 @@ def _check_and_send(nodes: Sequence[NodeSpec], sender: Connection) -> None:
 
 
 def existing_bags(nodes: Sequence[NodeSpec]) -> list[str]:
-    """Return a text for each recorder whose bag's folder exists already: it would refuse, and nothing be recorded."""
+    """Return a text for each recorder whose bag folder exists already; such a recorder would refuse to start."""
     problems = []
     for spec in nodes:
         given = dict(word.split(":=", 1) for word in spec.command if ":=" in word)
@@ -141,21 +141,21 @@ def _words(spec: NodeSpec) -> tuple[str, ...]:
 
 
 def _shared(specs: Sequence[NodeSpec]) -> dict[str, Values]:
-    """Return the ``/**`` values of each run directory; the first node with a value decides."""
+    """Return the ``/**`` values of each run directory; the first node that has a value decides."""
     sections = functools.cache(load_sections)
     found: dict[str, Values] = {}
     for spec in specs:
         own: Values = {}
         for option, word in itertools.pairwise(_words(spec)):
             if option == "--params-file":
-                with suppress(ParameterError):  # the check of the node reports it
+                with suppress(ParameterError):  # reported by the node's own check
                     own |= sections(Path(word)).get(SHARED, {})
         found[spec.group] = own | found.get(spec.group, {})
     return found
 
 
 def _configured(spec: NodeSpec) -> tuple[Any, Values, list[str]]:
-    """Return a node's configuration (None if it is refused), its values, and the problems of its command line."""
+    """Return a node's configuration (None if refused), its values, and the problems of its command line."""
     from instant_ic.bus.node_files import NodeFileError
 
     where = f"{spec.file}:{spec.line}: node {spec.label}"
@@ -165,7 +165,7 @@ def _configured(spec: NodeSpec) -> tuple[Any, Values, list[str]]:
         config_class, values = given_values(spec)
         return configure(config_class, values)[0], values, []
     except ParameterError as error:
-        # A file that cannot be read is one problem, however many nodes have it.
+        # An unreadable file is one problem, however many nodes use it, so its text names no node.
         node = "" if config_class is None else f" (node {spec.label})"
         at_line = [problem.where and not problem.where.startswith("-p ") for problem in error.problems]
         texts = zip(error.problems, at_line, strict=True)
@@ -174,19 +174,19 @@ def _configured(spec: NodeSpec) -> tuple[Any, Values, list[str]]:
         return None, values, [f"{where}: {error}"]
     except SystemExit:  # such as a remap of a name that begins with a dash
         return None, values, [f"{where}: its arguments cannot be read: {' '.join(_words(spec))}"]
-    except Exception as error:  # noqa: BLE001 - whatever a module raises on import, the node would raise too
+    except Exception as error:  # noqa: BLE001 - any error on import would end the node too
         return None, values, [f"{where}: cannot be loaded: {type(error).__name__}: {error}"]
 
 
 def _contradictions(spec: NodeSpec, shared: Values, values: Values, config: Any) -> Iterator[str]:
-    """Yield values that differ from the shared one, unless stated beside it or on the node's own entry."""
+    """Yield a text for each value that differs from the shared one without being set for this node on purpose."""
     effective = flatten(to_dict(config))
     for key, wanted in shared.items():
         value = values.get(key)
-        if key not in effective:  # the process's own parameters too
+        if key not in effective:  # such as the parameters of the process itself
             continue
         got = plain(effective[key])
-        with suppress(ValueError):  # the node that takes it reports it
+        with suppress(ValueError):  # reported by the check of the node that has this parameter
             if got == plain(typed_value(type(config), key, wanted.given)):
                 continue
         if value is None:
@@ -202,7 +202,7 @@ def _contradictions(spec: NodeSpec, shared: Values, values: Values, config: Any)
 
 
 def _declared_by_none(spec: NodeSpec, values: Values) -> list[str]:
-    """Return a node's shared values that no shipped node declares."""
+    """Return a text for each of a node's shared values that no shipped node declares."""
     from instant_ic.bus.node_files import node_class
 
     left = {key: value for key, value in values.items() if value.shared and key not in PROCESS_KEYS}

@@ -1,4 +1,4 @@
-"""One supervised process: start, output, end and restarts."""
+"""A supervised process: start, output, end and restarts."""
 
 from __future__ import annotations
 
@@ -35,12 +35,12 @@ Schedule = Sequence[tuple[signal.Signals, float]]
 """Signals that end a process, with the wait after each."""
 
 _CHILD = Path(__file__).with_name("child.py")
-_FLOOD_PAUSE_S = 0.005  # between two reads of output that is dropped: leaves the CPU to the others
-_PIPE_BYTES = 1 << 20  # a short delay of the launcher or its disk must not block the nodes
+_FLOOD_PAUSE_S = 0.005  # pause between two reads of dropped output, which leaves the CPU to other threads
+_PIPE_BYTES = 1 << 20  # large enough that a short delay of the launcher or its disk does not block the nodes
 
 
 def dies_with_us() -> tuple[str, ...]:
-    """Return the command prefix that makes the kernel kill the process when this thread dies, for whatever reason."""
+    """Return the command prefix by which the kernel kills the process when this thread dies for any reason."""
     return sys.executable, "-I", "-S", str(_CHILD), str(os.getpid())
 
 
@@ -54,7 +54,7 @@ class ProcessState(enum.Enum):
 
 
 class RespawnLimit:
-    """Limit on restarts of a process: a delay that doubles, and a number of restarts within a window.
+    """A limit on the restarts of a process: a delay that doubles, and a number of restarts within a window.
 
     Args:
         delay_s: wait before the first restart.
@@ -63,7 +63,7 @@ class RespawnLimit:
     MAX_DELAY_S = 15.0
     WINDOW_S = 60.0
     MAX_STARTS = 5
-    """The process is given up after more restarts than this within the window."""
+    """Largest number of restarts within the window; after more, the process is given up."""
 
     def __init__(self, delay_s: float) -> None:
         self.delay_s = delay_s
@@ -77,7 +77,7 @@ class RespawnLimit:
         return len(self._starts)
 
     def next_delay_s(self, now_s: float) -> float | None:
-        """Count one more restart; return the seconds to wait before it, or None if there were too many."""
+        """Count a restart; return the seconds to wait before it, or None if there were too many."""
         while self._starts and now_s - self._starts[0] > self.WINDOW_S:
             self._starts.popleft()
         if len(self._starts) >= self.MAX_STARTS:
@@ -93,7 +93,7 @@ class RespawnLimit:
 
 
 class OutputLimit:
-    """Passes on ``OUTPUT_BYTES_PER_S`` for each period of a node's output; a note stands for what is dropped."""
+    """A limit of ``OUTPUT_BYTES_PER_S`` on a node's output in each period. A note replaces dropped output."""
 
     PERIOD_S = 4.0
 
@@ -103,7 +103,7 @@ class OutputLimit:
         self._dropped_bytes = 0
 
     def pass_on(self, data: bytes) -> bytes:
-        """Return the data, after a note if some was dropped before; empty if it is dropped."""
+        """Return the data, preceded by a note if output was dropped before; empty if the data is dropped."""
         now_s = time.monotonic()
         if now_s >= self._period_ends_s:
             self._left_bytes, self._period_ends_s = self.PERIOD_S * OUTPUT_BYTES_PER_S, now_s + self.PERIOD_S
@@ -114,7 +114,7 @@ class OutputLimit:
         return self.note() + data
 
     def note(self) -> bytes:
-        """Return a line about dropped output, if there is some, and forget it."""
+        """Return a line about the dropped output, if any, and reset its count."""
         dropped, self._dropped_bytes = self._dropped_bytes, 0
         text = f"\n[launch: {dropped} bytes dropped: more than {OUTPUT_BYTES_PER_S} a second]\n"
         return text.encode() if dropped else b""
@@ -126,9 +126,9 @@ class ManagedProcess:
     Args:
         spec: the node to run.
         run_dir: run directory of the stack.
-        mark: text that the process and everything it starts carry in their environment.
-        show_line: called with each line of its output, on the forwarding thread.
-        report: called with texts about the log, on any thread.
+        mark: text that the process and all its descendants carry in their environment.
+        show_line: function called with the node and each line of its output, on the forwarding thread.
+        report: function called with texts about the log, on any thread.
     """
 
     def __init__(
@@ -145,11 +145,11 @@ class ManagedProcess:
         self.state = ProcessState.WAITING
         self.exit_status: int | None = None
         self.reason = ""
-        """Why the launcher ends it; empty when it ends by itself or with the stack."""
+        """Reason why the launcher ends the process; empty if it ends by itself or with the stack."""
         self.start_s = 0.0
-        """Monotonic time from which it should run."""
+        """Monotonic time of the next start."""
         self.started_s = 0.0
-        """Monotonic time of its last start."""
+        """Monotonic time of the last start."""
         self.silence = HeartbeatSilence()
         self._run_dir = spec.run_dir or run_dir
         self.log_path = self._run_dir / "log" / f"{spec.name}.log"
@@ -162,25 +162,25 @@ class ManagedProcess:
 
     @property
     def pid(self) -> int | None:
-        """Process id, which is also the id of its process group, while it runs."""
+        """Id of the process and of its process group; None while it does not run."""
         return self._popen.pid if self._popen is not None else None
 
     @property
     def ending(self) -> bool:
-        """True while it is being ended."""
+        """True while the launcher ends the process."""
         return self._ending is not None
 
     def start(self, on_output_end: Callable[[], None]) -> None:
         """Start the process.
 
         Args:
-            on_output_end: called on another thread when its output ends, which is soon before its own end.
+            on_output_end: function called on another thread when the output ends, shortly before the process ends.
 
         Raises:
-            OSError: the kernel refuses it.
+            OSError: the kernel refuses to start it.
             ValueError: an argument contains a zero byte.
         """
-        # A stack started by a node of another stack carries both marks, so that it ends with the outer one.
+        # A stack that a node of another stack has started carries both marks, so that it ends with the outer stack.
         marks = [mark for mark in (os.environ.get(VARIABLE), self.mark) if mark]
         environment = {
             **os.environ,
@@ -203,7 +203,7 @@ class ManagedProcess:
         )
         output = self._popen.stdout
         assert output is not None
-        with suppress(OSError):  # the user's pipe memory is used up: keep the usual 64 kB
+        with suppress(OSError):  # the user's pipe memory is used up: the pipe keeps its usual 64 kB
             fcntl.fcntl(output.fileno(), fcntl.F_SETPIPE_SZ, _PIPE_BYTES)
         self.state, self.started_s = ProcessState.RUNNING, time.monotonic()
         self._forwarder = threading.Thread(
@@ -234,24 +234,24 @@ class ManagedProcess:
         on_end()
 
     def send(self, signum: signal.Signals) -> None:
-        """Send a signal to the whole process group; SIGABRT only to the process itself, which then prints its stack."""
+        """Send a signal to the whole process group. SIGABRT goes only to the process itself, which prints its stack."""
         if self._popen is not None:
             with suppress(ProcessLookupError):
                 if signum is signal.SIGABRT:
                     os.kill(self._popen.pid, signum)
                 else:
                     os.killpg(self._popen.pid, signum)
-                # A stopped process handles no signal except SIGKILL until it continues.
+                # A stopped process handles no signal but SIGKILL until it continues.
                 os.killpg(self._popen.pid, signal.SIGCONT)
 
     def begin_end(self, schedule: Schedule, reason: str = "") -> None:
-        """Begin to end the process; :meth:`press_on` then sends these signals."""
+        """Begin to end the process. :meth:`press_on` then sends the signals of ``schedule``."""
         self._ending = deque(schedule)
         self._next_signal_s = 0.0
         self.reason = self.reason or reason
 
     def press_on(self, now_s: float) -> signal.Signals | None:
-        """Send the next ending signal when it is due; return the signal sent."""
+        """Send the next signal of the schedule if it is due; return the signal sent, or None."""
         if self._ending is None or now_s < self._next_signal_s or not self._ending:
             return None
         signum, wait_s = self._ending.popleft()
@@ -264,13 +264,13 @@ class ManagedProcess:
         return self._ending is not None and not self._ending and now_s >= self._next_signal_s
 
     def has_ended(self) -> bool:
-        """Return whether its own process has ended. It stays unreaped, so that its group id cannot be reused."""
+        """Return whether the process itself has ended. It is not reaped yet, so that its group id cannot be reused."""
         if self._popen is None:
             return False
         return os.waitid(os.P_PID, self._popen.pid, os.WEXITED | os.WNOHANG | os.WNOWAIT) is not None
 
     def reap(self) -> None:
-        """After ``has_ended``: kill the rest of its group, and set ``exit_status``."""
+        """Kill the rest of the process group and set ``exit_status``; call this after ``has_ended``."""
         assert self._popen is not None
         self.send(signal.SIGKILL)
         self.exit_status = self._popen.wait()
@@ -286,7 +286,7 @@ class ManagedProcess:
 
 
 def describe_exit(status: int) -> str:
-    """Return ``exit status 1``, or ``killed by SIGSEGV``."""
+    """Return an exit status as text, such as ``exit status 1`` or ``killed by SIGSEGV``."""
     if status >= 0:
         return f"exit status {status}"
     try:

@@ -20,13 +20,13 @@ _TYPES: dict[str, Callable[[str], object]] = {"str": str, "int": int, "float": f
 
 
 class _FileReader:
-    """Reads the entries of one launch file.
+    """A reader of the entries of one launch file.
 
     Args:
-        nodes: list to add the nodes to; shared with the included files.
-        problems: list to note the first mistake of each entry in; shared too.
+        nodes: list to which the nodes are added; shared with the included files.
+        problems: list to which the first mistake of each entry is added; shared with the included files.
         given: values of the file's arguments.
-        depth: number of files that include this one.
+        depth: number of files through which this file is included.
     """
 
     def __init__(
@@ -121,8 +121,8 @@ class _FileReader:
     def _include(self, body: YamlPlace, scope: Scope) -> None:
         fields = body.fields(("file", "arg", *CONDITION), ("file",))
         name = scope.text(fields["file"])
-        # The file sees only the arguments that it is given: one that a file hides (a switch that is unsafe for driving)
-        # stays hidden, whatever the command line says.
+        # An included file gets only the arguments that its include names. A switch that the including file leaves out,
+        # such as one that is unsafe for driving, therefore cannot be set on the command line.
         given = dict(scope.pairs(fields.get("arg"), "name", "value"))
         if not scope.holds(fields):
             return
@@ -141,7 +141,7 @@ class _FileReader:
 
 
 def _argument(body: YamlPlace) -> LaunchArgument:
-    """Read an ``arg``; its default may still contain substitutions."""
+    """Read an ``arg`` entry. Its default may still contain substitutions."""
     fields = body.fields(("name", "default", "description", "type"), ("name",))
     kind = fields["type"].text() if "type" in fields else "str"
     if kind not in _TYPES:
@@ -154,7 +154,7 @@ def _argument(body: YamlPlace) -> LaunchArgument:
 def read_launch_file(
     file: Path, arguments: Mapping[str, str] | None = None, run_dir: Path | None = None
 ) -> LaunchDescription:
-    """Read and check a launch file with everything that it includes.
+    """Read and check a launch file with all files that it includes.
 
     Args:
         file: the launch file.
@@ -162,7 +162,7 @@ def read_launch_file(
         run_dir: value of ``$(run-dir)``; default: ``paths.run_dir()``.
 
     Raises:
-        LaunchFileError: the first mistake of each entry, in file order.
+        LaunchFileError: the files have mistakes; it lists the first one of each entry, in file order.
     """
     given = dict(arguments or {})
     nodes: list[NodeSpec] = []
@@ -185,7 +185,7 @@ def read_launch_file(
 
 
 def read_arguments(file: Path) -> tuple[LaunchArgument, ...]:
-    """Return the ``arg`` entries of a launch file, whatever else it contains.
+    """Return the ``arg`` entries of a launch file, even if other entries have mistakes.
 
     Raises:
         LaunchFileError: the file cannot be read, or an argument is wrong.

@@ -1,9 +1,9 @@
-"""Outlives the launcher briefly and kills what its nodes have left behind; run as a script, never imported.
+"""Kill the processes that are left when the launcher has ended; run as the script ``python -I -S reaper.py``.
 
-``python -I -S reaper.py``. The launcher holds the other end of its standard input and writes MARK first. When the
-launcher has ended, for whatever reason, the reaper kills every process that carries MARK in its environment: the nodes,
-their children, and processes that left the node's process group for a session of their own, which neither group signals
-nor parent-death signals reach. It writes ``PID COMMAND`` for each, and exits.
+The launcher holds the other end of the reaper's standard input and writes MARK first. When the launcher has ended for
+any reason, the reaper kills every process that carries MARK in its environment: the nodes, their children, and
+processes that have left a node's process group for a session of their own, which neither group signals nor parent-death
+signals reach. It writes ``PID COMMAND`` for each of them, and exits.
 """
 
 import os
@@ -18,7 +18,7 @@ _LONGEST_S = 3.0
 
 
 def marked(mark: str) -> "list[int]":
-    """Return the processes that carry a mark; other users' are not readable, and cannot belong to this stack."""
+    """Return the processes that carry a mark. Those of other users are unreadable, and cannot belong to the stack."""
     wanted = mark.encode()
     found = []
     for name in os.listdir("/proc"):  # noqa: PTH208 - pathlib would stat each of them
@@ -30,14 +30,14 @@ def marked(mark: str) -> "list[int]":
 def _marks(pid: int) -> bytes:
     try:
         environment = Path(f"/proc/{pid}/environ").read_bytes()
-    except OSError:  # it has ended, or belongs to another user
+    except OSError:  # the process has ended, or belongs to another user
         return b""
     start = (b"\0" + environment).find(b"\0" + VARIABLE.encode() + b"=")
     return environment[start:].split(b"\0", 1)[0] if start >= 0 else b""
 
 
 def kill_marked(mark: str) -> "dict[int, str]":
-    """Kill every process that carries a mark, until none is left; returns process id → command line."""
+    """Kill every process that carries a mark, until none is left; return their command lines by process id."""
     killed: dict[int, str] = {}
     deadline = time.monotonic() + _LONGEST_S
     while time.monotonic() < deadline:
@@ -63,7 +63,7 @@ def kill_marked(mark: str) -> "dict[int, str]":
 
 
 def main() -> None:
-    """Wait for the launcher's end."""
+    """Wait for the launcher's end, then kill the marked processes."""
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.SIG_IGN)  # the reaper must outlive the launcher
     received = b""
@@ -74,7 +74,7 @@ def main() -> None:
     try:
         for pid, command in killed.items():
             os.write(1, f"{pid} {command}\n".encode())
-    except OSError:  # the reader is gone
+    except OSError:  # the reader of standard output is gone
         pass
 
 

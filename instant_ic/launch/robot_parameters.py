@@ -1,4 +1,4 @@
-"""Rules between the parameters of the nodes that drive one robot; each node's own rules are in its configuration."""
+"""Rules between the parameters of the nodes of one robot. Each node's own rules are in its configuration."""
 
 from __future__ import annotations
 
@@ -17,19 +17,20 @@ RELATED = (
     "zenoh_gateway",
     "vlp16_driver",
 )
-"""Nodes that have something to agree on."""
+"""Nodes whose parameters must agree."""
 _MISSED = 2
 """Number of messages that a time-out must span."""
 
 
 @dataclass(frozen=True)
 class Driving:
-    """A node that drives.
+    """A node that takes part in driving.
 
     Attributes:
-        at: its place, ``launch/full.yaml:12``.
-        config: its configuration.
-        meant: keys that may differ: set by its own entry of the launch file, or compared with a ``/**`` section.
+        at: place of the node, such as ``launch/full.yaml:12``.
+        config: configuration of the node.
+        meant: keys that may differ from other nodes, because the node's own entry of the launch file sets them, or
+            because they have been compared with a ``/**`` section already.
     """
 
     at: str
@@ -57,21 +58,21 @@ _SPANS = (
     ("navigator", "state_timeout_s", "arbiter", "rate_hz", 1e9),
     ("virtual_robot", "state_timeout_s", "arbiter", "rate_hz", 1e9),
 )
-"""Node and time-out; node and rate of the messages, at most the last number."""
+"""Node and time-out, and the node and rate of the messages that the time-out must span; the number limits the rate."""
 
 _SIMULATED = (
     ("console", "server.access.simulated"),
     ("foxglove_bridge", "simulated"),
     ("zenoh_gateway", "insecure_loopback_commands"),
 )
-"""Nodes through which operators come, and the parameter that opens them to all users of the machine."""
+"""Nodes that admit operators, and the parameter that opens them to all users of the machine."""
 
 
 def disagreements(robot: Mapping[str, Sequence[Driving]]) -> Iterator[str]:
-    """Yield the contradictions between the nodes of one robot, one text each.
+    """Yield a text for each contradiction between the nodes of one robot.
 
     Args:
-        robot: node → configuration of each such node; a node that is elsewhere is missing.
+        robot: name → the nodes of that name with their configurations; nodes outside the launch file are missing.
     """
     found = (_between(dict(zip(robot, nodes, strict=True))) for nodes in itertools.product(*robot.values()))
     yield from dict.fromkeys(itertools.chain.from_iterable(found))
@@ -108,7 +109,7 @@ def _between(robot: Mapping[str, Driving]) -> Iterator[str]:
 
 
 def _open_doors(robot: Mapping[str, Driving]) -> Iterator[str]:
-    """Yield nodes that need no token because every robot is simulated, beside a base on a serial device."""
+    """Yield a text for each node that admits operators without a token although the base drives a real robot."""
     port = robot["crawler_base"].value("roboclaw.port") if "crawler_base" in robot else ""
     if not port.startswith("/dev/") or port.startswith("/dev/shm/"):  # the simulator's is in its run directory
         return

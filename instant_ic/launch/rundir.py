@@ -12,19 +12,19 @@ from instant_ic.bus.registry import open_lock
 
 
 class StackRunningError(RuntimeError):
-    """Another stack uses the run directory; the message says which one and what to do."""
+    """Another stack uses the run directory; the message names it and says what to do."""
 
 
 @contextmanager
 def stack_lock(run_dir: Path, label: str) -> Iterator[None]:
-    """Hold the lock while a stack runs; the kernel releases it when the launcher dies, however it dies.
+    """Hold the lock while a stack runs. The kernel releases it when the launcher dies for any reason.
 
     Args:
         run_dir: the run directory.
-        label: shown to a second stack that tries to start.
+        label: name of this stack in the error of a second stack that tries to start.
 
     Raises:
-        StackRunningError: another stack holds it.
+        StackRunningError: another stack holds the lock.
         RegistryError: the lock file does not belong to this user.
     """
     descriptor = open_lock(run_dir / "launch.lock", create=True)

@@ -1,4 +1,4 @@
-"""The launcher's output: plain lines for logs and CI, a live table of the nodes in a terminal."""
+"""The launcher's output: plain lines for logs and CI, and a live table of the nodes in a terminal."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ from instant_ic.util.safe_text import direct, masked, visible
 _COLOURS = ("cyan", "green", "magenta", "yellow", "blue", "bright_cyan", "bright_green", "bright_magenta")
 _LINE_STYLES = {" WARNING ": "yellow", " ERROR ": "red", " CRITICAL ": "bold red"}
 _LOGGED = re.compile(r"\d{4}-\d\d-\d\d (\d\d:\d\d:\d\d\.\d{3} ([A-Z]+) +(.*))")
-"""A line that a node logs: date, time, level, text."""
+"""A line of a node's log: date, time, level, text."""
 _TABLE_S = 0.5
 _HOLDS_BACK_S = 30.0
-"""Warnings wait for "ready" for this long, since most of a start's end with it."""
+"""Warnings are held back for this long or until the stack is ready, since most warnings of a start resolve by then."""
 
 
 @dataclass(frozen=True)
@@ -32,12 +32,12 @@ class StackView:
 
     Attributes:
         rows: its processes, in the order of the launch file.
-        missing: nodes that have not reported yet that they run.
-        waiting: steps of the start that are still missing (camera, map, ...).
+        missing: nodes that have not yet reported that they run.
+        waiting: steps of the start-up that are still missing, such as the camera's first image.
         addresses: address of each page, by its node's label, once it is available.
         faults: topics that have stopped or are too slow, as text.
         looked: true once the launcher receives heartbeats.
-        ending: true while the stack shuts down; then nothing is waited for.
+        ending: true while the stack shuts down; then the screen waits for no node.
         pace: pace of the simulation, as text; empty in real time.
     """
 
@@ -52,15 +52,15 @@ class StackView:
 
 
 class StackScreen:
-    """Prints lines and events, what the stack waits for, and the console's address.
+    """The screen of a stack: lines and events, the missing steps of the start-up, and the console's address.
 
     Args:
-        nodes: names, in the order of the launch file.
+        nodes: names of the nodes, in the order of the launch file.
         live: keep a table of the nodes below the lines.
-        progress_period_s: without the table, how often to print what the stack still waits for.
-        console: destination; for tests.
-        verbose: print every line of the nodes. Otherwise warnings and errors, each once, and what is not a log line;
-            those of the start only if it is not over within ``_HOLDS_BACK_S``.
+        progress_period_s: period of the reports of missing steps, if there is no table.
+        console: destination of the output; for tests.
+        verbose: print every line of the nodes. Otherwise print each warning and error once, and lines that are not
+            log lines; warnings of the start-up only if it takes longer than ``_HOLDS_BACK_S``.
     """
 
     def __init__(
@@ -84,12 +84,12 @@ class StackScreen:
         self._reported_faults: tuple[str, ...] = ()
         self._verbose = verbose
         self._shows = dict.fromkeys(nodes, True)
-        """True if a node's last log line was shown; the lines of a traceback follow it."""
+        """Node -> whether its last log line was shown; the lines of a traceback that follow are treated alike."""
         self._shown: set[tuple[str, str]] = set()
         self._held_back: list[tuple[str, str]] = []
 
     def start(self) -> None:
-        """Begin the table."""
+        """Show the table."""
         if self._live is not None:
             self._live.start()
 
@@ -104,7 +104,7 @@ class StackScreen:
         self._console.file.flush()
 
     def node_line(self, node: str, text: str) -> None:
-        """Print a line of a node's output, if it is worth it."""
+        """Print a line of a node's output if it is worth showing."""
         if self._verbose or self._is_worth_showing(node, text):
             self._print_line(node, text)
 
@@ -137,7 +137,7 @@ class StackScreen:
         self._console.print(Text(f"{'launch':>{self._width}} │ {visible(text)}", style="bold red" if bad else "bold"))
 
     def refresh(self, view: StackView) -> None:
-        """Print what has changed since the last view, and render the table again."""
+        """Print the changes since the last view, and render the table again."""
         now = time.monotonic()
         if view.looked and not view.ending:
             self._report_progress(view, now)
@@ -159,7 +159,7 @@ class StackScreen:
             self._ready = True
             at = f": {self._page}" if self._page else ""
             self.event(f"ready after {now - self._started_s:.1f} s{at}")
-            self._held_back.clear()  # the start's; what is still wrong is in the nodes' own reports
+            self._held_back.clear()  # warnings of the start-up; lasting faults are in the nodes' diagnoses
             for row in view.rows:
                 if row.message and not self._verbose:
                     self.event(f"{row.node}: {row.message}", bad=row.state not in STATE_STYLES)
@@ -183,7 +183,7 @@ class StackScreen:
         return next((url for node, url in self._addresses.items() if node.rpartition("/")[2] == "console"), None)
 
     def _report_faults(self, faults: tuple[str, ...]) -> None:
-        """Report a topic when it becomes faulty and when it recovers; changing numbers are not reported again."""
+        """Report a topic when it becomes faulty and when it recovers, but not when only its numbers change."""
         before = {fault.partition(":")[0] for fault in self._reported_faults}
         now = {fault.partition(":")[0] for fault in faults}
         if new := [fault for fault in faults if fault.partition(":")[0] not in before]:

@@ -1,7 +1,7 @@
 """Substitutions of launch files: ``$(var NAME)``, ``$(config FILE)``, ``$(run-dir)`` and ``$(eval EXPRESSION)``.
 
-Nothing is ever executed: ``simpleeval`` computes the expressions, without functions. A variable in an expression is one
-operand, whatever it looks like.
+No code is executed: ``simpleeval`` computes the expressions, without functions. A variable in an expression is a single
+operand, whatever its text.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from instant_ic.util import paths
 
 
 class SubstitutionError(ValueError):
-    """A substitution cannot be evaluated; the message says which and why."""
+    """A substitution cannot be evaluated; the message names it and gives the reason."""
 
 
 def substitute(text: str, variables: Mapping[str, str], run_dir: Path) -> str:
@@ -28,7 +28,7 @@ def substitute(text: str, variables: Mapping[str, str], run_dir: Path) -> str:
 
     Raises:
         SubstitutionError: a substitution or variable is unknown, a file is missing, an expression is wrong, or a
-            parenthesis is open.
+            parenthesis is not closed.
     """
     parts: list[str] = []
     position = 0
@@ -44,7 +44,7 @@ def truth(text: str) -> bool:
     """Return the boolean value of a condition's text.
 
     Raises:
-        SubstitutionError: it is neither true or 1 nor false, 0 or empty.
+        SubstitutionError: the text is none of true, 1, false, 0 and empty.
     """
     word = text.strip().lower()
     if word in ("true", "1"):
@@ -85,7 +85,7 @@ def _replacement(body: str, variables: Mapping[str, str], run_dir: Path) -> str:
 
 
 class _Variable(str):
-    """A variable in an expression: compares as text, and stands for true or false by its text."""
+    """A variable in an expression. It compares as text, and its truth value is that of its text."""
 
     __slots__ = ()
     __hash__ = str.__hash__
@@ -105,7 +105,7 @@ def _evaluated(expression: str, variables: Mapping[str, str]) -> str:
     names = {"true": True, "false": False, **{name: _Variable(value) for name, value in variables.items()}}
     try:
         return _text(SimpleEval(functions={}, names=names).eval(expression))
-    except Exception as error:  # noqa: BLE001 - any error that an operator raises for its operands
+    except Exception as error:  # noqa: BLE001 - operators raise any kind of error for unsuitable operands
         hint = "; name variables without $(var ...)" if "$(" in expression else ""
         raise SubstitutionError(f"$(eval {expression}): {error}{hint}") from None
 

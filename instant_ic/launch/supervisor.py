@@ -31,15 +31,15 @@ HANG_SCHEDULE: Schedule = ((signal.SIGABRT, 2.0), (signal.SIGKILL, 1.0))
 """Signals to a hung node: the first makes it write the stack of every thread, the second ends it."""
 
 _HURRIED_SCHEDULE: Schedule = ((signal.SIGKILL, 1.0),)
-_ROUND_S = 0.25  # also the time to react to Ctrl-C; the end of a node is noticed at once
-_END_S = 0.01  # a process ends this soon after its output
+_ROUND_S = 0.25  # also the longest time to react to Ctrl-C; the end of a node is noticed at once
+_END_S = 0.01  # usual time from the end of a process's output to its own end
 _LAST_LINES_S = 0.5
 _LAST_LOG_S = 2.0
 _REAPER = Path(__file__).with_name("reaper.py")
 
 
 class SupervisorOutput(Protocol):
-    """Destination of the supervisor's output. Lines come from a thread for each node, events from these threads too."""
+    """Destination of the supervisor's output. Lines come from one thread per node, events from any thread."""
 
     def node_line(self, node: str, text: str) -> None:
         """Show a line of a node's output."""
@@ -48,22 +48,22 @@ class SupervisorOutput(Protocol):
         """Show an event reported by the supervisor."""
 
     def refresh(self, processes: Sequence[ManagedProcess], health: HealthMonitor | None, ending: bool) -> None:
-        """Show the present state; called several times a second, with ``health`` once the processes are started."""
+        """Show the present state; called several times a second. ``health`` is None until all processes are started."""
 
 
 class Supervisor:
-    """Brings every process from its actual to its wanted state, again and again, until the end.
+    """A supervisor that repeatedly brings every process from its actual to its wanted state, until the end.
 
-    Each round compares whether a process is wanted with whether it runs, and does the one next thing: start it, send
-    it the next signal of its end, detect that it hangs, or leave it alone. The order of starts does not matter to the
-    nodes.
+    Each round compares for each process whether it should run with whether it does, and takes one step: start it, send
+    the next signal that ends it, detect that it hangs, or leave it alone. The nodes do not depend on the order of
+    starts.
 
     Args:
         nodes: the nodes to run.
         run_dir: run directory of the stack.
         output: destination of lines and events.
         stop_schedule: signals at shutdown, with the wait after each.
-        make_health: called once all processes are started; None: heartbeats are not watched.
+        make_health: function called once all processes are started; None: heartbeats are not watched.
     """
 
     def __init__(
@@ -84,22 +84,22 @@ class Supervisor:
         self._make_health = make_health
         self._health: HealthMonitor | None = None
         self._output_ended = threading.Event()
-        self._output_ended.set()  # start at once
+        self._output_ended.set()  # the first round starts at once
         self._stop = False
         self._hurry = False
         self._status = 0
         self._last_look_s = 0.0
 
     def request_stop(self, hurry: bool = False) -> None:
-        """Request the end, from a signal handler or another thread; ``hurry`` goes straight to SIGKILL."""
+        """Request the end, from a signal handler or another thread. ``hurry`` sends SIGKILL at once."""
         self._hurry = self._hurry or hurry
         self._stop = True
 
     def run(self) -> int:
-        """Start everything, watch it until the end, and stop what is left.
+        """Start all nodes, watch them until the end, and stop those that still run.
 
         Returns:
-            0 when a stop was requested or every node ended normally; 1 when a required node failed, or when all have
+            0 if a stop was requested or every node ended normally; 1 if a required node failed, or if all nodes have
             ended and at least one of them failed.
         """
         try:
@@ -125,7 +125,7 @@ class Supervisor:
 
     @contextmanager
     def _reaper(self) -> Iterator[None]:
-        """Run a helper process that kills what is left when this process dies, even by SIGKILL."""
+        """Run a helper that kills the remaining processes when this process dies, even by SIGKILL."""
         process = subprocess.Popen(
             (sys.executable, "-I", "-S", str(_REAPER)),
             stdin=subprocess.PIPE,
@@ -150,7 +150,7 @@ class Supervisor:
     # -- one round -------------------------------------------------------------------------------
 
     def _step(self, wait_s: float) -> None:
-        """Wait shortly, then move every process towards its wanted state."""
+        """Wait for at most ``wait_s``, then bring every process closer to its wanted state."""
         if self._output_ended.wait(wait_s):
             self._output_ended.clear()
             time.sleep(_END_S)
@@ -158,7 +158,7 @@ class Supervisor:
             self._health.poll()
         self._reconcile(time.monotonic())
         if self._health is None and self._make_health is not None and not self._stop:
-            self._health = self._make_health()  # after the starts, so that no process waits for it
+            self._health = self._make_health()  # after the starts, so that they need not wait for it
         self._output.refresh(self.processes, self._health, self._stop)
 
     def _reconcile(self, now_s: float) -> None:
@@ -213,10 +213,10 @@ class Supervisor:
         process.reap()
         if self._stop:
             return
-        # Children in a session of their own, outside the process group, would keep its devices and ports open.
+        # Children in a session of their own, outside the process group, would keep the node's devices and ports open.
         for pid, command in kill_marked(process.mark).items():
             self._output.event(f"killed a process that {process.spec.label} left behind: {pid} {command}", bad=True)
-        process.finish_output(_LAST_LINES_S)  # shown before the event
+        process.finish_output(_LAST_LINES_S)  # before the event, so that the last lines are shown first
         self._after_end(process)
 
     def _after_end(self, process: ManagedProcess) -> None:

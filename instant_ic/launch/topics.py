@@ -1,4 +1,4 @@
-"""Nominal rates of topics (``config/topics.yaml``), and checks against them: alive, right rate."""
+"""Nominal rates of topics (``config/topics.yaml``), and checks of measured rates and ages against them."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from instant_ic.config.yaml_text import read_yaml
 from instant_ic.util import paths
 
 ALIVE_PERIODS = 10.0
-"""A topic whose newest message is older than this many periods has stopped."""
+"""Age of the newest message, in nominal periods, above which a topic counts as stopped."""
 
 FREQ_OK_SHARE = 0.9
-"""Share of the nominal rate above which a rate is right."""
+"""Share of the nominal rate above which a measured rate is right."""
 
 
 @dataclass(frozen=True)
@@ -22,14 +22,14 @@ class TopicRate:
 
     Attributes:
         rate_hz: nominal rate, messages per second.
-        when: condition under which it is published, as text; empty if it always is.
+        when: condition under which the topic is published, as text; empty if it always is.
     """
 
     rate_hz: float
     when: str = ""
 
     def alive(self, age_s: float) -> bool:
-        """Return whether the newest message is recent enough; its age is inf before the first."""
+        """Return whether the newest message is recent enough. Its age is inf before the first message."""
         return age_s * self.rate_hz < ALIVE_PERIODS
 
     def freq_ok(self, rate_hz: float) -> bool:
@@ -54,12 +54,12 @@ class TopicRate:
 
 @functools.cache
 def topic_rates() -> dict[str, TopicRate]:
-    """Return the shipped table, ``config/topics.yaml``; it is read once."""
+    """Return the shipped table ``config/topics.yaml``, which is read once."""
     table = read_yaml(paths.shipped_file("config", "topics.yaml").read_text())
     return {topic: TopicRate(**entry) for topic, entry in table.items()}
 
 
 def expected_rate(topic: str) -> TopicRate | None:
-    """Return the expected rate of a topic, whose first part may be a namespace; None if the table does not have it."""
+    """Return the expected rate of a topic, with or without a namespace; None if it is not in the table."""
     rates = topic_rates()
     return rates.get(topic) or rates.get(f"/{topic.lstrip('/').partition('/')[2]}")
