@@ -14,7 +14,9 @@ from console_pages import (
     make_demo,
     moving,
     room_seen,
+    start_driving,
     wait_alike,
+    wait_stopped,
     wait_until,
 )
 from console_servers import DRIVE, WATCH
@@ -52,6 +54,18 @@ def test_without_webgl_the_page_says_what_to_do_and_only_stops_the_robot(browser
     expect_body(page, "estop", "set")
     assert demo.server.drive.gate.driver is None and not demo.commands
     context.close()
+
+
+def test_a_page_whose_view_is_lost_stops_the_robot_and_begins_anew(open_page, demo):
+    page = open_page()
+    expect_body(page, "image", "live")
+    start_driving(page, demo)
+    page.evaluate(
+        "document.getElementById('view').getContext('webgl2').getExtension('WEBGL_lose_context').loseContext()"
+    )
+    wait_stopped(page, demo)
+    expect_body(page, "image", "live")
+    start_driving(page, demo)
 
 
 @pytest.mark.parametrize("mode", ["real", "virtual"])

@@ -36,6 +36,12 @@ const images = new Images(viewer, link);
 const screen = new Screen(viewer, images, look, link, lease);
 const recording = new Recording(link);
 const wake = () => screen.wake();
+// A page whose view is lost (crash or update of the graphics driver) must not drive. The new page has a view, or only stops.
+canvas.addEventListener("webglcontextlost", () => {
+  lease.mayDrive = false;
+  lease.handOver();
+  location.reload();
+});
 
 /** Returns the viewer. Without WebGL 2 it throws, and the page can only stop the robot. */
 function makeViewer() {
