@@ -1,5 +1,5 @@
-"""Local 3D model of the surroundings: LiDAR revolutions accumulated by pose (docs/depth.md). Arrays in, arrays out.
+"""Local 3D model of the surroundings from LiDAR revolutions and their poses (docs/depth.md).
 
-``local_model`` is the model and its rendering, ``mapper`` feeds it from revolutions and transforms, ``kernels`` are the
-compiled loops.
+``local_model`` holds the model and renders it, ``mapper`` feeds it with revolutions and transforms, and ``kernels`` has
+the compiled loops.
 """

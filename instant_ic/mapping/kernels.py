@@ -1,26 +1,27 @@
-"""Compiled loops of the local model: a window of columns of voxels that moves with the robot.
+"""Compiled loops of the local model, a window of voxel columns that moves with the robot.
 
 Adding a revolution (``add_revolution``; occupancy mapping by log odds, Moravec and Elfes, 1985):
 
 1. ``_free_beams``: walk every n-th beam through the columns (Amanatides and Woo, 1987) and lower the odds of the voxels
-   that it passes, except beside and along known surfaces.
-2. ``_add_ends``: raise the odds at the beams' ends, and add them to the moments of their column.
+   that it passes, except where it passes beside or along a known surface.
+2. ``_add_ends``: raise the odds of the voxels in which beams end, and add the ends to the moments of their column.
 
 Rendering a depth image:
 
-3. ``solid_columns``: find the solid voxels and the surface of each column, in the steps ``_index_columns``,
-   ``_measured_voxels`` (and what lies between measured ones), ``_continue_upwards`` and ``_bridge``.
-4. ``put_plates``: continue the tops of low things behind their faces.
+3. ``solid_columns``: find the solid voxels and the surface of each column. ``_index_columns`` numbers the columns,
+   ``_measured_voxels`` marks measured voxels and those between them, ``_continue_upwards`` marks voxels above them, and
+   ``_bridge`` closes gaps between columns.
+4. ``put_plates``: continue the tops of low objects behind their faces.
 5. ``cast_rays``: walk each pixel's ray through the columns to the first surface (``_cast``).
 
 State of the model, with N a power of two:
 
-- ``key`` (N, N, 2) int32: cell that each column holds. The window needs no shifting: a column is reused when a point or
-  a beam reaches another cell with the same place modulo N.
+- ``key`` (N, N, 2) int32: cell that each column holds. The window is never shifted: a column is reused when a point or
+  a beam reaches another cell with the same index modulo N.
 - ``odds`` (N, N, L) int8: log odds of each voxel, 0 where nothing was measured.
 - ``sums`` (N, N, 6) float32: count, x, y, xx, xy and yy of a column's points, relative to its cell's centre.
-- ``last`` (N, N) float32: path of the robot at the newest point, in the units of ``now``.
-- ``sight`` (N, N) float32: height up to which revolutions with points in a column looked there.
+- ``last`` (N, N) float32: path length of the robot at the newest point, in the unit of ``now``.
+- ``sight`` (N, N) float32: greatest height that the uppermost ring has reached in a column with points.
 """
 
 from __future__ import annotations
@@ -31,30 +32,30 @@ import numpy as np
 from numba import njit
 
 HIT, MOST, LEAST = 4, 12, -8
-THROUGH = 2  # odds that a beam takes from the voxels of a column whose mean it passes; elsewhere 1
+THROUGH = 2  # odds that a beam subtracts in a column through whose mean it passes; in an empty column it subtracts 1
 OCCUPIED, FREE = 3, -2
-UNSEEN, OPEN, PLATE = -2, -1, -10  # values of the index of columns
-_BESIDE_M = 0.02  # a beam that passes a column's mean farther away than this does not test its surface
-_GRAZING = 4.0  # a beam runs along a surface whose points spread this factor more along it than across (variance)
-_CROWDED_M = 1.2  # nearer, beams are so dense that a quarter of them is enough
-_SHORT_OF_M = 0.12  # beams free space up to this distance before their end
-_THING_CELLS = 12  # sides of a thing take their height from columns up to this many cells away
-_HANGS_M = 1.5  # sills, shelves and table tops are lower, lintels are not
-_RINGS = math.radians(2.0)  # angle between two rings: a return of the uppermost alone may be lost
-_MOST_POINTS = 256.0  # a column's sums are halved from here on, so that they follow changes
+UNSEEN, OPEN, PLATE = -2, -1, -10  # values in the index of columns
+_BESIDE_M = 0.02  # largest distance from a column's mean at which a beam counts as passing through its surface
+_GRAZING = 4.0  # a beam grazes a surface if the variance of its points along the beam is this factor of that across
+_CROWDED_M = 1.2  # below this range, beams are so dense that a quarter of them is enough
+_SHORT_OF_M = 0.12  # distance before a beam's end at which it stops freeing space
+_THING_CELLS = 12  # distance, in cells, up to which columns of an object share their height
+_HANGS_M = 1.5  # height that separates sills, shelves and table tops from lintels
+_RINGS = math.radians(2.0)  # angle between two rings; the uppermost ring alone may lack a return
+_MOST_POINTS = 256.0  # number of points at which a column's sums are halved, so that they follow changes
 
-# Reasons why a voxel of a column is solid.
+# Reasons for a voxel to be solid.
 EMPTY, MEASURED, BETWEEN, UP, DOWN, BEHIND = 0, 1, 2, 3, 4, 5
-# Surfaces that a ray ends on: one of the above on an upright surface, or:
+# Surfaces on which a ray ends: one of the above for an upright surface, or:
 NOTHING, TOP, FLOOR, CEILING, ASSUMED = 0, 6, 7, 8, 9
-# As UP, but in doubt: beams there had no return (a window above this wall, or one behind this thing), or it stands on
-# nothing (a sill). A ray goes on through it as far as places are known.
+# A doubtful UP: beams there had no return (a window above the wall or behind the object), or the column has free space
+# below (a sill). A ray passes through it as long as the columns behind are known.
 PANE = 10
 
 
 @njit(cache=True)
 def _take(key, odds, sums, last, sight, ix, iy, now, keep):  # type: ignore[no-untyped-def]
-    """Return the place of a cell's column; clear it first if it holds another cell, or is too old."""
+    """Return the indices of a cell's column. Clear the column first if it holds another cell or is too old."""
     n = key.shape[0]
     a, b = ix & (n - 1), iy & (n - 1)
     if key[a, b, 0] != ix or key[a, b, 1] != iy or now - last[a, b] > keep:
@@ -68,7 +69,7 @@ def _take(key, odds, sums, last, sight, ix, iy, now, keep):  # type: ignore[no-u
 
 @njit(cache=True)
 def _walk(origin, dx, dy, t, cell):  # type: ignore[no-untyped-def]
-    """Return the cell at ``t`` along a ray, the steps to its neighbours, the next borders and their distances."""
+    """Return the cell at ``t`` along a ray, the steps to the next cell, ``t`` at the next borders, its increments."""
     ix, iy = math.floor((origin[0] + t * dx) / cell), math.floor((origin[1] + t * dy) / cell)
     step_x, step_y = (1 if dx > 0 else -1), (1 if dy > 0 else -1)
     next_x = ((ix + (dx > 0)) * cell - origin[0]) / dx if dx != 0 else np.inf
@@ -80,7 +81,7 @@ def _walk(origin, dx, dy, t, cell):  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def _free_beams(key, odds, sums, last, sight, points, origin, cell, low, now, keep, first, stride, reach):  # type: ignore[no-untyped-def]
-    """Lower the odds of the voxels that beams passed; arguments of ``add_revolution``."""
+    """Lower the odds of the voxels that beams have passed; see ``add_revolution`` for the arguments."""
     levels, moments = odds.shape[2], np.empty(6)
     for i in range(first, len(points), stride):
         dx, dy, dz = points[i, 0] - origin[0], points[i, 1] - origin[1], points[i, 2] - origin[2]
@@ -119,7 +120,7 @@ def _free_beams(key, odds, sums, last, sight, points, origin, cell, low, now, ke
 
 @njit(cache=True)
 def _add_ends(key, odds, sums, last, sight, points, origin, cell, low, body, now, keep, reach):  # type: ignore[no-untyped-def]
-    """Raise the odds at the ends of beams, and add them to their columns; arguments of ``add_revolution``."""
+    """Raise the odds at the beams' ends and add the ends to their columns; see ``add_revolution`` for the arguments."""
     levels, steepest = odds.shape[2], -np.inf
     for i in range(len(points)):
         dx, dy = points[i, 0] - origin[0], points[i, 1] - origin[1]
@@ -151,16 +152,16 @@ def _add_ends(key, odds, sums, last, sight, points, origin, cell, low, body, now
 
 @njit(cache=True)
 def add_revolution(key, odds, sums, last, sight, points, origin, cell, low, body, now, keep, first, stride, reach):  # type: ignore[no-untyped-def]
-    """Free the voxels that beams passed, then add their ends. All in metres and in the model's frame.
+    """Free the voxels that beams have passed, then add the beams' ends. All lengths are metres in the model's frame.
 
     Args:
         key, odds, sums, last, sight: state of the model.
         points: ends of the beams, (M, 3); origin: start of the beams, (3,).
         cell: side of a voxel; low: height of the lowest voxels.
-        body: heights (from, to) whose points make a column's mean.
-        now, keep: path of the robot, and how much of it is remembered.
-        first, stride: the beams ``first``, ``first + stride``... free space.
-        reach: points farther away are not added, and free space up to there.
+        body: range of heights (from, to) whose points enter a column's moments.
+        now, keep: path length of the robot now, and path length after which columns are forgotten.
+        first, stride: the beams ``first``, ``first + stride``, ... free space.
+        reach: largest range; farther points are not added, and beams free space only up to it.
     """
     _free_beams(key, odds, sums, last, sight, points, origin, cell, low, now, keep, first, stride, reach)
     _add_ends(key, odds, sums, last, sight, points, origin, cell, low, body, now, keep, reach)
@@ -168,9 +169,10 @@ def add_revolution(key, odds, sums, last, sight, points, origin, cell, low, body
 
 @njit(cache=True)
 def _runs_along(key, sums, a, b, cell, dx, dy, moments):  # type: ignore[no-untyped-def]
-    """Return whether a beam of horizontal direction (``dx``, ``dy``) runs along the surface of a column's points.
+    """Return whether a beam of horizontal direction (``dx``, ``dy``) grazes the surface of a column's points.
 
-    Such a beam passes beside the surface for many columns: a centimetre decides, which no pose has.
+    Such a beam passes close to the surface in many columns. Whether it passes beside or through it would depend on a
+    centimetre, and poses are not that accurate.
     """
     _moments(key, sums, a, b, cell, 1, moments)
     along = moments[2] * dx * dx + 2 * moments[3] * dx * dy + moments[4] * dy * dy
@@ -179,9 +181,9 @@ def _runs_along(key, sums, a, b, cell, dx, dy, moments):  # type: ignore[no-unty
 
 @njit(cache=True)
 def ceiling_levels(key, odds, last, now, keep, centre, within, first, under):  # type: ignore[no-untyped-def]
-    """Return the histogram (L,) of the level of the uppermost solid voxel of columns around ``centre`` (2,) cells.
+    """Return the histogram (L,) of the level of the uppermost solid voxel in the columns around cell ``centre`` (2,).
 
-    Only columns with no other solid voxel in the ``under`` levels below it count: a wall has some.
+    Columns with another solid voxel in the ``under`` levels below it do not count, because they may be walls.
     """
     n, levels = key.shape[0], odds.shape[2]
     found = np.zeros(levels, np.int64)
@@ -193,7 +195,7 @@ def ceiling_levels(key, odds, last, now, keep, centre, within, first, under):  #
                 continue
             for level in range(levels - 1, first, -1):
                 if odds[a, b, level] >= OCCUPIED:
-                    alone = True  # a wall has points below
+                    alone = True  # false for a wall, which has points below
                     for below in range(max(level - under, 0), level - 1):
                         alone = alone and odds[a, b, below] <= 0
                     found[level] += alone
@@ -203,7 +205,7 @@ def ceiling_levels(key, odds, last, now, keep, centre, within, first, under):  #
 
 @njit(cache=True)
 def _index_columns(odds, sums, last, now, keep, ground, top, index):  # type: ignore[no-untyped-def]
-    """Write the numbers of the columns with a solid voxel to ``index``, and return how many there are."""
+    """Assign a number in ``index`` to each column with a solid voxel, and return their count."""
     n, count = odds.shape[0], 0
     for a in range(n):
         for b in range(n):
@@ -222,12 +224,12 @@ def _index_columns(odds, sums, last, now, keep, ground, top, index):  # type: ig
 
 @njit(cache=True)
 def _measured_voxels(odds, code, tops, ground, top):  # type: ignore[no-untyped-def]
-    """Write the solid voxels of a column as far as they follow from its own measurements.
+    """Mark the solid voxels of a column that follow from its own measurements.
 
     Args:
-        odds: log odds of the column, (L,); code: out, (L,); ground, top: as in ``solid_columns``.
-        tops: out, (3,): one past the highest measured level, first free level above, and one past the highest level
-            that beams met again and again.
+        odds: log odds of the column, (L,); code: result, (L,); ground, top: as in ``solid_columns``.
+        tops: result, (3,): one past the highest measured level, first free level above it, and one past the highest
+            level with repeated hits.
     """
     levels, below = len(odds), -1
     for level in range(ground, top):
@@ -245,7 +247,7 @@ def _measured_voxels(odds, code, tops, ground, top):  # type: ignore[no-untyped-
 
 @njit(cache=True)
 def _continue_upwards(key, odds, sight, index, a, b, tops, highest, low, cell, ground, top, code):  # type: ignore[no-untyped-def]
-    """Continue a column above its measured part: to the ceiling or to its thing's top, as its neighbours decide."""
+    """Continue a column above its measured part to the ceiling or its object's top, as most neighbours do."""
     n, levels = key.shape[0], odds.shape[2]
     at, x0, y0 = index[a, b], key[a, b, 0], key[a, b, 1]
     open_above, ends = 0, 0
@@ -265,8 +267,8 @@ def _continue_upwards(key, odds, sight, index, a, b, tops, highest, low, cell, g
     elif end >= top and ends > 2 * open_above:
         end = tops[at, 0]
     elif end < top:
-        # It ends somewhere between the highest point and the lowest beam above, as high as the thing around. A sill, a
-        # shelf or a table top is thin: half way to the next beam it would hide the wall behind it.
+        # The column ends between the highest point and the lowest beam above, and is as high as its object. A sill, a
+        # shelf or a table top is thin. If it extended half way to the beam above, it would hide the wall behind it.
         end = max(tops[at, 0] if hangs else (tops[at, 0] + end) // 2, highest[at])
     doubtful = sight[a, b] > height or hangs
     code[tops[at, 0] : end] = PANE if end == levels and doubtful else UP
@@ -274,16 +276,17 @@ def _continue_upwards(key, odds, sight, index, a, b, tops, highest, low, cell, g
 
 @njit(cache=True)
 def solid_columns(key, odds, sums, last, sight, now, keep, cell, low, ground, top, index):  # type: ignore[no-untyped-def]
-    """Find the solid voxels of every column with points, and its surface.
+    """Find the solid voxels and the surface of every column with points.
 
     Args:
         key, odds, sums, last, sight: state of the model; now, keep, cell, low: as in ``add_revolution``.
-        ground, top: lowest level and one past the highest between floor and ceiling.
-        index: out, (N, N) int32: row of each column in the results, ``OPEN`` without a solid voxel.
+        ground, top: lowest level and one past the highest level between floor and ceiling.
+        index: result, (N, N) int32: row of each column in ``codes`` and ``faces``; ``OPEN`` without a solid voxel,
+            ``UNSEEN`` if nothing was measured there recently.
 
     Returns:
-        ``codes`` (M, L) uint8, and ``faces`` (M, 6) float32: a point x, y of the surface, its normal (0, 0: none), and
-        how far it reaches from the point to either side.
+        ``codes`` (M, L) uint8, the reason for each voxel to be solid; and ``faces`` (M, 6) float32: a point (x, y) of
+        the surface, its normal (0, 0 if it has none), and its extent from the point to either side.
     """
     n, levels = key.shape[0], odds.shape[2]
     count = _index_columns(odds, sums, last, now, keep, ground, top, index)
@@ -308,7 +311,7 @@ def solid_columns(key, odds, sums, last, sight, now, keep, cell, low, ground, to
 
 @njit(cache=True)
 def _hangs(odds, ground):  # type: ignore[no-untyped-def]
-    """Return whether beams have passed below the lowest solid voxel of a column."""
+    """Return whether a column has free space below its lowest solid voxel."""
     for level in range(ground, len(odds)):
         if odds[level] >= OCCUPIED:
             return False
@@ -319,9 +322,9 @@ def _hangs(odds, ground):  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def _highest_around(key, index, tops, top):  # type: ignore[no-untyped-def]
-    """Return one past the highest measured level of each column's thing, (M,), as far as its own column is open.
+    """Return one past the highest measured level of each column's object, (M,), limited by the column's free levels.
 
-    A side that is seen from near alone is not met by the beams that met the front's upper edge from afar.
+    An object's side may have been seen only from near, where no beam reaches the upper edge that its front has shown.
     """
     n = key.shape[0]
     places = np.argwhere(index >= 0)
@@ -343,7 +346,7 @@ def _highest_around(key, index, tops, top):  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def _moments(key, sums, a, b, cell, around, total):  # type: ignore[no-untyped-def]
-    """Write mean x, y, variances xx, xy, yy and count of the points in ``around`` cells around a column."""
+    """Compute mean x, y, variances xx, xy, yy and count of the points up to ``around`` cells around a column."""
     n = key.shape[0]
     x0, y0 = key[a, b, 0], key[a, b, 1]
     total[:] = 0
@@ -368,7 +371,7 @@ def _moments(key, sums, a, b, cell, around, total):  # type: ignore[no-untyped-d
 
 @njit(cache=True)
 def _set_face(key, sums, index, a, b, cell, face):  # type: ignore[no-untyped-def]
-    """Write the surface of a column: a plane through the points around it where they lie on one, else its mean."""
+    """Set a column's surface to a plane, if the points around it lie on one, else to the mean of its points."""
     n = key.shape[0]
     x0, y0 = key[a, b, 0], key[a, b, 1]
     own, total = np.zeros(6), np.zeros(6)
@@ -382,14 +385,14 @@ def _set_face(key, sums, index, a, b, cell, face):  # type: ignore[no-untyped-de
         angle = 0.5 * math.atan2(2 * total[3], total[2] - total[4])
         ux, uy = math.cos(angle), math.sin(angle)
         off_plane = abs((own[0] - total[0]) * uy - (own[1] - total[1]) * ux)
-        if off_plane > 0.03 and own[5] > 0.04 * total[5]:  # a few points are noise of the plane
+        if off_plane > 0.03 and own[5] > 0.04 * total[5]:  # fewer own points count as noise of the plane
             continue
         off = (own[0] - total[0]) * ux + (own[1] - total[1]) * uy
         face[0] = (x0 + 0.5) * cell + total[0] + off * ux
         face[1] = (y0 + 0.5) * cell + total[1] + off * uy
         face[2], face[3] = -uy, ux
-        # Of points spread evenly the farthest lie at 1.73 standard deviations. A surface that the next columns
-        # continue is not cut.
+        # Evenly spread points reach 1.73 standard deviations from their mean. The surface extends farther if one of the
+        # next columns continues it.
         ends = 1.73 * math.sqrt(max(own[2] * ux * ux + 2 * own[3] * ux * uy + own[4] * uy * uy, 0.0)) + 0.006
         for side in range(2):
             face[4 + side] = ends
@@ -406,7 +409,7 @@ def _set_face(key, sums, index, a, b, cell, face):  # type: ignore[no-untyped-de
 
 @njit(cache=True)
 def _bridge(key, index, faces, cell):  # type: ignore[no-untyped-def]
-    """Let columns without points between two of one plane show it too: beams lie apart far from the robot."""
+    """Extend planes over columns without points, which occur far from the robot because beams diverge."""
     n = key.shape[0]
     bridged = []
     for a in range(n):
@@ -429,7 +432,7 @@ def _bridge(key, index, faces, cell):  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def _fill_between(code, odds, below, above, ground):  # type: ignore[no-untyped-def]
-    """Fill between two measured voxels, or from the floor (``below`` -1) up, as far as nothing there is free."""
+    """Fill the gap below a measured voxel, from both ends up to the first free voxel; ``below`` -1 is the floor."""
     for level in range(above - 1, max(below, ground - 1), -1):
         if odds[level] <= FREE:
             break
@@ -444,9 +447,13 @@ def _fill_between(code, odds, below, above, ground):  # type: ignore[no-untyped-
 
 @njit(cache=True)
 def put_plates(key, odds, index, codes, faces, origin, cell, ground, behind, highest):  # type: ignore[no-untyped-def]
-    """Continue the tops of low things behind their measured faces, where nothing was measured.
+    """Continue the tops of low objects behind their measured faces, where nothing was measured.
 
-    ``index`` becomes ``PLATE`` minus the level of the top. ``behind``: how far, in metres; ``highest``: level.
+    Args:
+        key, odds: state of the model; ``key`` is updated for the new columns.
+        index: result of ``solid_columns``; new columns get ``PLATE`` minus the level of the top.
+        codes, faces, origin, cell, ground: as in ``cast_rays`` and ``solid_columns``.
+        behind: distance to continue, in metres; highest: largest level of a top.
     """
     n, levels = key.shape[0], odds.shape[2]
     for a in range(n):
@@ -465,7 +472,7 @@ def put_plates(key, odds, index, codes, faces, origin, cell, ground, behind, hig
             x, y = faces[at, 0], faces[at, 1]
             dx, dy = x - origin[0], y - origin[1]
             length = math.sqrt(dx * dx + dy * dy)
-            inner = True  # behind its outermost columns a thing would become wider than it is
+            inner = True  # outermost columns are not continued, because the object would become too wide
             for side in (-1, 1):
                 found = False
                 for far in (1, 2):
@@ -489,12 +496,12 @@ def put_plates(key, odds, index, codes, faces, origin, cell, ground, behind, hig
 
 @njit(cache=True)
 def _meet_column(code, face, origin, dx, dy, dz, flat, t, leave, cell, low, pending):  # type: ignore[no-untyped-def]
-    """Return where and on what a ray meets a column between ``t`` and ``leave``; ``pending`` if nothing is nearer.
+    """Return length and kind of a ray's hit on a column between ``t`` and ``leave``, or ``pending`` if that is nearer.
 
     Args:
         code, face: codes and surface of the column, (L,) and (6,); origin: start of the ray, (3,).
-        dx, dy, dz, flat: direction of the ray, and the length of its horizontal part.
-        pending: length and kind of the surface met before.
+        dx, dy, dz, flat: direction of the ray, and length of its horizontal part.
+        pending: length and kind of the hit found in earlier columns.
     """
     levels = len(code)
     z0 = math.floor((origin[2] + t * dz - low) / cell)
@@ -529,10 +536,10 @@ def _meet_column(code, face, origin, dx, dy, dz, flat, t, leave, cell, low, pend
 
 @njit(cache=True)
 def _cast(key, index, codes, faces, origin, ray, cell, low, limit, reach, unseen):  # type: ignore[no-untyped-def]
-    """Return length and kind of the first surface on a ray, how far it came, and its way through unseen columns.
+    """Return length and kind of a ray's first hit, the length followed, and the part of it through unseen columns.
 
     Args:
-        ray: unit direction, (3,); limit: length at which it meets floor or ceiling.
+        ray: unit direction, (3,); limit: length at which the ray meets floor or ceiling.
         key, index, codes, faces, origin, cell, low, reach, unseen: as in ``cast_rays``.
     """
     n = key.shape[0]
@@ -542,7 +549,7 @@ def _cast(key, index, codes, faces, origin, ray, cell, low, limit, reach, unseen
     ix, iy, step_x, step_y, next_x, next_y, per_x, per_y = _walk(origin, dx, dy, 0.0, cell)
     t, missing = 0.0, 0.0
     pending = np.inf, np.int64(NOTHING)
-    pane, hidden = np.inf, False  # the last pane; hidden: no column behind it is known
+    pane, hidden = np.inf, False  # length at the last pane, and whether the columns behind it are unknown
     while t < end:
         leave = min(next_x, next_y, end)
         a, b = ix & (n - 1), iy & (n - 1)
@@ -594,10 +601,10 @@ def cast_rays(  # type: ignore[no-untyped-def]
         key: state of the model; index, codes, faces: results of ``solid_columns``.
         origin: start of the rays, (3,); rays: unit directions in the model's frame, (M, 3).
         cell, low: as in ``add_revolution``.
-        ceiling: height of the level ceiling (inf: none); assumed: it was not seen.
-        reach: longest horizontal distance; unseen: longest way of a ray through columns that were not seen, in metres.
-        depth: out, (M,) float32; kind: out, (M,) uint8; 0 where a ray ends nowhere.
-        free: out, (M,) float32: how far a ray came.
+        ceiling: height of the level ceiling, inf if unknown; assumed: true if the ceiling was not measured.
+        reach: largest horizontal distance; unseen: largest distance of a ray through unseen columns, in metres.
+        depth: result, (M,) float32; kind: result, (M,) uint8; both 0 for a ray without a hit.
+        free: result, (M,) float32: length up to which a ray passes known free space or its hit.
     """
     for i in range(len(rays)):
         dz = rays[i, 2]

@@ -1,9 +1,9 @@
-"""Local 3D model of the LiDAR revolutions of the last metres, with free space carved, and its depth images.
+"""Local 3D model of the LiDAR revolutions of the last metres, and its depth images.
 
-The model is a window of columns of voxels around the robot. Beams free the voxels that they pass, so people and moved
-things vanish. Each column also keeps the moments of its points, from which surfaces get their place between voxels. A
-depth image is cast through the columns. Where a column was not measured, the usual structure of a building is assumed,
-in space: an upright surface goes on up until something free, floor and ceiling are level.
+The model is a window of voxel columns around the robot. Beams free the voxels that they pass, so people and moved
+objects vanish. Each column also keeps the moments of its points, which place surfaces more finely than voxels do. Depth
+images are rendered by casting rays through the columns. Where nothing was measured, the usual structure of a building
+is assumed: upright surfaces continue upwards to the first free voxel, and floor and ceiling are level.
 """
 
 from __future__ import annotations
@@ -23,25 +23,25 @@ from instant_ic.util.jit import leave_out_blas
 
 Floats = NDArray[np.floating]
 STRIDE = 4
-"""One in this many beams of a revolution frees space, another one each time."""
+"""One beam in this many frees space; each revolution uses others."""
 
 
 @dataclass(frozen=True)
 class ModelTuning:
-    """Size and tuning of the model; lengths in metres, heights over the floor.
+    """Size and tuning of the model. Lengths are metres, heights are above the floor.
 
     Attributes:
-        window: columns of the window each way, a power of two.
+        window: number of columns of the window in x and in y, a power of two.
         cell_m: side of a voxel.
-        reach_m: farther points are not kept; the window reaches 12.8 m.
+        reach_m: largest range of points that are kept; the window reaches 12.8 m.
         low_m: height of the lowest voxels.
-        floor_m: points below this height belong to the floor.
-        body_m: heights of the points that place an upright surface; above, a ceiling may be among them.
+        floor_m: height below which points belong to the floor.
+        body_m: range of heights of the points that place an upright surface; higher points may belong to a ceiling.
         ceiling_m: lowest height of a ceiling.
-        ceiling_clear_m: height below a ceiling in which nothing may have been measured.
-        ceiling_columns: fewest columns that make a ceiling.
-        unseen_m: longest way of a ray through columns that were not seen; a longer one ends nowhere.
-        plate_above_m: things whose top is less than this above the camera may get a plate on top.
+        ceiling_clear_m: depth below a ceiling in which a column must have no points.
+        ceiling_columns: smallest number of columns in a ceiling.
+        unseen_m: largest distance of a ray through unseen columns; a ray that goes farther has no hit.
+        plate_above_m: largest height of an object's top above the camera at which it is continued by a plate.
     """
 
     window: int = 512
@@ -65,9 +65,9 @@ class LocalModelConfig(Checked):
     """Parameters of the local model.
 
     Attributes:
-        keep_m: path of the robot after which measurements are forgotten; odometry drifts.
-        height_m: height of the window over the floor.
-        behind_m: length by which the top of a low thing continues behind its face, where nothing was measured.
+        keep_m: path length of the robot after which measurements are forgotten, because odometry drifts.
+        height_m: height of the window above the floor.
+        behind_m: length by which the top of a low object continues behind its face, where nothing was measured.
     """
 
     keep_m: Positive = 10.0
@@ -77,13 +77,13 @@ class LocalModelConfig(Checked):
 
 @dataclass(frozen=True)
 class LocalDepth:
-    """Depth image of the model.
+    """Depth image rendered from the model.
 
     Attributes:
         depth_m: radial depth in metres, (H, W) float32; 0 is unknown.
         sigma: relative standard deviation, (H, W) float32; inf where unknown.
         kind: kind of surface of each pixel (constants of ``kernels``), (H, W) uint8.
-        free_m: distance up to which space is free, (H, W) float32.
+        free_m: distance up to which the ray is free, (H, W) float32.
     """
 
     depth_m: NDArray[np.float32]
@@ -93,7 +93,7 @@ class LocalDepth:
 
 
 class LocalModel:
-    """Accumulates points in a frame whose z axis is up and whose floor is z = 0. Memory is fixed: about 35 MB."""
+    """Accumulates points in a frame with z up and the floor at z = 0. It takes 35 MB of memory."""
 
     def __init__(self, config: LocalModelConfig | None = None) -> None:
         self.config = config or LocalModelConfig()
@@ -116,13 +116,13 @@ class LocalModel:
         """Add a revolution.
 
         Args:
-            points: points in the model's frame, (N, 3) metres; those that are not finite are left out.
+            points: points in the model's frame, (N, 3) metres; non-finite points are ignored.
             origin: start of the beams, (3,).
-            advance_m: path of the robot since the last revolution.
-            stride: one in this many beams frees space.
+            advance_m: path length of the robot since the last revolution.
+            stride: one beam in this many frees space.
 
         Raises:
-            ValueError: other shapes, an origin that is not finite, or a negative advance.
+            ValueError: a shape is wrong, the origin is not finite, or the advance is negative.
         """
         points, origin = np.asarray(points, np.float64), np.asarray(origin, np.float64)
         if points.ndim != 2 or points.shape[1] != 3 or origin.shape != (3,):
@@ -141,14 +141,14 @@ class LocalModel:
         self.revolutions += 1
 
     def ceiling_m(self, origin: Floats) -> float | None:
-        """Return the height over the floor of the level ceiling around a place (3,); None if none was seen."""
+        """Return the height above the floor of the level ceiling around a point (3,); None if none was seen."""
         first = round((TUNING.ceiling_m - TUNING.low_m) / TUNING.cell_m)
         centre = np.floor(np.asarray(origin)[:2] / TUNING.cell_m).astype(np.int64)
         found = kernels.ceiling_levels(
             self._key, self._odds, self._last, np.float32(self._path_m), np.float32(self.config.keep_m), centre,
             round(TUNING.reach_m / TUNING.cell_m), first, round(TUNING.ceiling_clear_m / TUNING.cell_m),
         )  # fmt: skip
-        # Nothing is seen through a ceiling: the highest level that is as wide as some other counts.
+        # Nothing is visible through a ceiling, so the highest level that is about as wide as the widest is chosen.
         wide = np.convolve(found, np.ones(3), "same")
         enough = np.flatnonzero(wide >= max(TUNING.ceiling_columns, 0.3 * wide.max()))
         if len(enough) == 0:
@@ -158,12 +158,12 @@ class LocalModel:
         return float(TUNING.low_m + (np.average(near, weights=found[near]) + 0.5) * TUNING.cell_m)
 
     def render(self, model_from_camera: Matrix, size: tuple[int, int], ceiling_m: float | None = None) -> LocalDepth:
-        """Render the depth of a panorama.
+        """Render an equirectangular depth image.
 
         Args:
             model_from_camera: pose of the camera, (4, 4).
-            size: height and width.
-            ceiling_m: height over the floor of the ceiling to assume where none was seen; None: unknown.
+            size: height and width in pixels.
+            ceiling_m: height of the ceiling above the floor, used if the model has seen none; None if unknown.
         """
         config, cell = self.config, TUNING.cell_m
         origin = np.asarray(model_from_camera[:3, 3], np.float64)
@@ -192,7 +192,7 @@ class LocalModel:
         return LocalDepth(depth, _SIGMA[kind], kind, free)
 
     def points(self) -> NDArray[np.float32]:
-        """Return the centres of the solid voxels in the model's frame, on the surface of their column, (N, 3)."""
+        """Return a point for each solid voxel, (N, 3): the mean x, y of its column, and the voxel's height."""
         known = (self._path_m - self._last) <= self.config.keep_m
         a, b, level = np.nonzero((self._odds >= kernels.OCCUPIED) & known[..., None])
         count = self._sums[a, b, 0]
@@ -202,8 +202,8 @@ class LocalModel:
         return np.column_stack([across, z]).astype(np.float32)
 
 
-#: Relative standard deviation of depth for each kind of pixel: 68 % of the errors are smaller in seven generated and
-#: scanned worlds (docs/depth.md).
+#: Relative standard deviation of depth by kind of pixel. In seven generated and scanned worlds, 68 % of the errors are
+#: smaller (docs/depth.md).
 _SIGMA = np.array([np.inf, 0.012, 0.012, 0.015, 0.015, 0.1, 0.07, 0.005, 0.027, 0.13, 0.014], np.float32)
 
 

@@ -1,4 +1,4 @@
-"""Feeds the local model from LiDAR revolutions and transforms."""
+"""Mapper that feeds the local model with LiDAR revolutions and transforms."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ class MapperTuning:
     """Tuning of the mapper.
 
     Attributes:
-        jump_m: change of the pose's correction beyond drift that is a jump.
+        jump_m: change of the pose's correction, beyond drift, that counts as a jump, in metres.
         jump_rad: the same in angle.
         drift: share of the motion by which odometry may drift.
-        keep_s: seconds of motion, such as turns in place, that count as ``keep_m`` of the path.
-        back_ns: a stamp that goes back by more than this starts the model again.
-        most_points: most points of a revolution; one with more is refused.
-        enough_points: points of a revolution that are used.
-        still_m: motion up to which the robot counts as standing.
+        keep_s: time in motion, such as turning on the spot, that counts as a path of ``keep_m``, in seconds.
+        back_ns: step back in time above which the model is cleared.
+        most_points: largest number of points of a revolution; one with more is refused.
+        enough_points: number of points of a revolution above which only a part is used.
+        still_m: motion up to which the robot counts as standing, in metres.
         still_rad: the same in angle.
     """
 
@@ -46,7 +46,7 @@ TUNING = MapperTuning()
 
 
 class CloudError(ValueError):
-    """A revolution cannot be added; the text says why."""
+    """A revolution cannot be added."""
 
 
 @dataclass(frozen=True)
@@ -55,8 +55,8 @@ class MapperConfig(Checked):
 
     Attributes:
         model: parameters of the model.
-        every_m: metres of motion to the next revolution that is added.
-        every_s: seconds to the next revolution while the robot stands, for things that move around it.
+        every_m: motion between two revolutions that are added, in metres.
+        every_s: time between two revolutions while the robot stands, in seconds, for objects that move around it.
     """
 
     model: LocalModelConfig = field(default_factory=LocalModelConfig)
@@ -65,13 +65,13 @@ class MapperConfig(Checked):
 
 
 class LocalMapper:
-    """Adds revolutions to a ``LocalModel``, each one when the next arrives: by then the odometry around it is known.
+    """Adds revolutions to a ``LocalModel``. Each is added when the next arrives, because its odometry is then known.
 
-    The model follows the corrections of the pose while they are small: surfaces then fit together better than by
-    odometry alone. A jump (a loop closure, a relocalization) moves the model with the robot instead.
+    Small corrections of the pose shift new revolutions in the model, so that surfaces fit together better than with
+    odometry alone. At a jump (a loop closure, a relocalization), the model moves with the robot instead.
 
     Args:
-        transforms: poses over time.
+        transforms: poses of the sensors over time.
         config: parameters.
     """
 
@@ -86,14 +86,14 @@ class LocalMapper:
         self._held: TimedPoints | None = None
         self._taken_ns: int | None = None
         self._taken_at: Matrix | None = None
-        self._reference: tuple[int, Matrix] | None = None  # stamp and correction of the last look-up
+        self._reference: tuple[int, Matrix] | None = None  # stamp and map_from_odom at the last look-up
         self._model_from_map = np.eye(4)
 
     def revolution(self, new: TimedPoints) -> None:
-        """Hold a revolution; add the one held before if it is due. ``xyz`` is called only for those that are added.
+        """Hold a revolution, and add the previous one if it is due. Only revolutions that are added are decoded.
 
         Raises:
-            CloudError: the revolution is empty or its stamp went back; the model is cleared for the latter.
+            CloudError: the revolution is empty or too large, or time went back, which clears the model.
             TransformError: the pose of the LiDAR is not known.
         """
         held, self._held = self._held, None
@@ -104,7 +104,7 @@ class LocalMapper:
             raise CloudError(f"time went back by {(newest - new.stamp_ns) / 1e9:.1f} s: the local model starts again")
         count = len(new.time_s)
         if not 0 < count <= TUNING.most_points:
-            raise CloudError(f"a revolution of {count} points is left out (1 to {TUNING.most_points} are possible)")
+            raise CloudError(f"a revolution of {count} points is ignored (1 to {TUNING.most_points} are allowed)")
         self._held = new
         if held is not None:
             self._add(held)
@@ -123,27 +123,27 @@ class LocalMapper:
         model_from_map = self._model_from_map_at(frame, middle_ns)
         time_s, points = revolution.time_s, revolution.xyz()
         if len(points) != len(time_s):
-            raise CloudError(f"a revolution of {len(points)} points with {len(time_s)} times is left out")
+            raise CloudError(f"a revolution of {len(points)} points with {len(time_s)} times is ignored")
         step = -(-len(points) // TUNING.enough_points)
-        # Other points each time: of beams that fire in the same order, every second would be of the same rings.
+        # Start at another point each time. Beams fire in a fixed order, so a fixed start would use only some rings.
         first = self.model.revolutions % step
         lidar = points_at(
             points[first::step], time_s[first::step], stamp_ns,
             lambda at_ns: model_from_map @ self._map_from(frame, at_ns),
         )  # fmt: skip
         if len(lidar) == 0:
-            raise CloudError("a revolution without a finite point is left out")
+            raise CloudError("a revolution without a finite point is ignored")
         advance_m = 0.0
         if self._taken_ns is not None and (moved_m > TUNING.still_m or turned_rad > TUNING.still_rad):
             since_s = max(stamp_ns - self._taken_ns, 0) / 1e9
             advance_m = max(moved_m, min(since_s, self.config.every_s) * self.config.model.keep_m / TUNING.keep_s)
-        # At rest revolutions are few: all beams free space, so that removed things vanish soon.
+        # At rest, few revolutions are added. All their beams free space, so that removed objects vanish soon.
         stride = 1 if moved_m < self.config.every_m else STRIDE
         self.model.add(lidar, (model_from_map @ self._map_from(frame, middle_ns))[:3, 3], advance_m, stride)
         self._taken_ns, self._taken_at = stamp_ns, odom_from_lidar
 
     def _map_from(self, frame: str, stamp_ns: int) -> Matrix:
-        """Return the pose of a sensor in the map at a time; by odometry alone if there is no map."""
+        """Return the pose of a sensor in the map at a time, or in odometry if there is no map."""
         return self._correction(stamp_ns) @ self.transforms.lookup("odom", frame, stamp_ns)
 
     def _correction(self, stamp_ns: int) -> Matrix:
@@ -153,10 +153,10 @@ class LocalMapper:
             return np.eye(4) if self._reference is None else self._reference[1]
 
     def _model_from_map_at(self, frame: str, stamp_ns: int) -> Matrix:
-        """Return the pose of the map in the model; a jump of the map since the last call moves the model too.
+        """Return the pose of the map in the model. A jump since the last call moves the model with the robot.
 
-        Images and revolutions come in any order of their stamps, so correction and motion are compared over the same
-        time: a turn on slipping tracks changes the correction by degrees between them and is no jump.
+        Images and revolutions come in any order of their stamps. The change of the correction is therefore compared
+        with the motion over the same time. A turn on slipping tracks may change it by degrees without being a jump.
         """
         map_from_odom = self._correction(stamp_ns)
         if self._reference is not None:
@@ -164,7 +164,7 @@ class LocalMapper:
             odom_from_sensor = self.transforms.lookup("odom", frame, stamp_ns)
             try:
                 start = self.transforms.lookup("odom", frame, reference_ns)
-            except TransformError:  # too long ago
+            except TransformError:  # the reference is older than the buffer
                 start = odom_from_sensor
             moved_m = float(np.linalg.norm(odom_from_sensor[:3, 3] - start[:3, 3]))
             shift = (map_from_odom - before) @ np.append(odom_from_sensor[:3, 3], 1.0)
@@ -194,28 +194,28 @@ class LocalMapper:
 
 @dataclass(frozen=True)
 class LocalView:
-    """The model seen from a camera."""
+    """The model and the pose of a camera in it."""
 
     model: LocalModel
     model_from_camera: Matrix
 
     @property
     def ceiling_m(self) -> float | None:
-        """Height of the ceiling over the camera; None if none was seen."""
+        """Height of the ceiling above the camera; None if none was seen."""
         found = self.model.ceiling_m(self.model_from_camera[:3, 3])
         return None if found is None else found - float(self.model_from_camera[2, 3])
 
     def render(self, size: tuple[int, int], ceiling_m: float | None) -> LocalDepth:
-        """Render a depth image; ``ceiling_m`` over the camera is assumed where no ceiling was seen."""
+        """Render a depth image; ``ceiling_m`` above the camera is used if the model has seen no ceiling."""
         over_floor = None if ceiling_m is None else ceiling_m + float(self.model_from_camera[2, 3])
         return self.model.render(self.model_from_camera, size, over_floor)
 
 
 def correction(transforms: TransformBuffer, stamp_ns: int) -> Matrix:
-    """Return the pose of odometry in the map at a time, or the newest if that time is not covered.
+    """Return map_from_odom at a time, or the newest if that time is not covered.
 
     Raises:
-        TransformError: there is none.
+        TransformError: the transform is not known.
     """
     try:
         return transforms.lookup("map", "odom", stamp_ns)
@@ -224,5 +224,5 @@ def correction(transforms: TransformBuffer, stamp_ns: int) -> Matrix:
 
 
 def _angle(first: Matrix, second: Matrix) -> float:
-    """Return the angle between two poses."""
+    """Return the angle between two poses, radians."""
     return math.acos(min(1.0, max(-1.0, float(np.trace(first[:3, :3].T @ second[:3, :3]) - 1) / 2)))
