@@ -1,4 +1,4 @@
-"""Commands from outside the run directory: their topics, and the limits that they must keep."""
+"""Commands from outside the run directory: their topics and limits."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ class CommandLimits(Checked):
 
     Attributes:
         max_age_s: s; an older command is refused. The clocks of both machines must agree better than this.
-        lease_s: s; while one sender drives, commands of others are refused until it has been silent for this long.
+        lease_s: s; other senders' commands are refused until the driving sender has been silent for this long.
         max_linear_mps: m/s; a faster command is refused. The arbiter limits the commands that pass.
         max_angular_rps: rad/s; a faster command is refused.
     """

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from typing import Any
 
 SUBPROTOCOLS = ("foxglove.sdk.v1", "foxglove.websocket.v1")
-"""Names of the protocol: since foxglove-sdk 0.14, and earlier. The messages used here are the same in both."""
+"""Names of the protocol since foxglove-sdk 0.14, and before it. The messages used here are the same in both."""
 
 WARNING, ERROR = 1, 2
 """Levels of a status message."""
@@ -37,7 +37,7 @@ def message_data(subscription: int, log_ns: int, payload: bytes | memoryview) ->
 
 
 def parameter_values(values: Mapping[str, Any], request: str) -> str:
-    """Return the answer to a request for parameters. Infinity and NaN, which JSON lacks, become text."""
+    """Return the answer to a request for parameters. Infinity and NaN become text because JSON lacks them."""
     values = json.loads(json.dumps(values), parse_constant=str)
     entries = [{"name": name, "value": value} for name, value in values.items() if value is not None]
     return text("parameterValues", parameters=entries, id=request)
@@ -47,11 +47,11 @@ def parse(data: str) -> tuple[str, list[Any], str]:
     """Parse a client's text message.
 
     Returns:
-        Its op, its arguments and its request id. The arguments are pairs (subscription, channel) of ``subscribe``,
-        subscriptions of ``unsubscribe``, names of ``getParameters``, and none of other messages.
+        The message's op, arguments and request id. The arguments are pairs (subscription, channel) for ``subscribe``,
+        subscriptions for ``unsubscribe`` and names for ``getParameters``; other messages have none.
 
     Raises:
-        FoxgloveProtocolError: the message or one of its fields has another form.
+        FoxgloveProtocolError: the message or one of its fields is malformed.
     """
     try:
         content = json.loads(data)

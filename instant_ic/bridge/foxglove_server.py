@@ -56,8 +56,8 @@ class FoxgloveBridgeConfig(Checked):
         host: address to listen on; 0.0.0.0 opens the server to the network.
         port: TCP port; 0: any free port, reported in the log.
         sign_in: whether viewers need the token of this start: ``auto`` (unless ``simulated``), ``always`` or ``never``.
-        simulated: there are simulated robots only. Then ``auto`` needs no token on this machine. The simulator's launch
-            files set it.
+        simulated: all robots are simulated. Then ``auto`` needs no token on this machine. The simulator's launch files
+            set this parameter.
         allowed_origins: web pages that may connect, by their Origin, besides those of this machine; "*" allows every
             page. Programs that are not browsers send no Origin and are allowed.
         allowed_hosts: names under which viewers may reach the server, besides localhost and any address.
@@ -100,7 +100,7 @@ class _Viewer:
         self._bytes = 0
 
     def put(self, subscription: int, publish_ns: int, payload: bytes | memoryview) -> int:
-        """Queue a message; drop the oldest to make room, and return how many."""
+        """Queue a message. Drop the oldest ones if there is no room; return the number of dropped messages."""
         frame = protocol.message_data(subscription, publish_ns, payload)
         dropped = 0
         while self._messages and (len(self._messages) >= _BACKLOG or self._bytes + len(frame) > _MAX_BACKLOG_BYTES):
@@ -121,7 +121,7 @@ class _Viewer:
         return frame
 
     def unsubscribe(self, subscription: int) -> None:
-        """End a subscription, if there is one with this number."""
+        """End the subscription with this number, if it exists."""
         channel = self.subscriptions.pop(subscription, None)
         if channel is not None:
             channel.watchers.pop(self, None)
@@ -140,9 +140,9 @@ class _Channel:
         id: number of the channel.
         type_name: type of the topic.
         advertisement: the channel as it is offered to viewers.
-        watchers: subscription of each viewer.
-        latched: publication time and payload of each publisher's newest message if the topic is latched, for viewers
-            that come later.
+        watchers: number of each viewer's subscription.
+        latched: publication time and payload of each publisher's newest message on a latched topic, for viewers that
+            subscribe later.
         subscription: subscription on the bus while there are viewers.
     """
 
@@ -169,7 +169,7 @@ class FoxgloveServer:
         refusal: reason of the last rejection.
         token: token that viewers need in the address; empty: none.
         port: TCP port of the server.
-        wake: set when a viewer comes or goes, so that :meth:`reconcile` is due.
+        wake: event that is set when a viewer comes or goes; the node then calls :meth:`reconcile`.
 
     Raises:
         FoxgloveError: the server cannot start.
@@ -340,18 +340,18 @@ class FoxgloveServer:
             await asyncio.wait_for(self._server.shutdown(_END_S / 2), _END_S)
 
     def _refusal(self, request: web.BaseRequest) -> tuple[int, str]:
-        """Return HTTP status and reason of a refused request; the reason of an accepted one is empty."""
+        """Return the HTTP status and the reason for refusing a request; the reason is empty if it is accepted."""
         headers, config = request.headers, self._config
         if why := refusal(headers.get("Origin"), headers.get("Host"), config.allowed_origins, config.allowed_hosts):
             return 403, f"{why} of foxglove_bridge"
         if self.token and not hmac.compare_digest(request.query.get("token", "").encode(), self.token.encode()):
-            return 401, "no token or a wrong one; foxglove_bridge's log names the file that has the address with it"
+            return 401, "the token is missing or wrong; foxglove_bridge's log names the file with the right address"
         if len(self._viewers) >= config.max_clients:
-            return 503, f"{config.max_clients} viewers are connected; see max_clients of foxglove_bridge"
+            return 503, f"{config.max_clients} viewers are connected: close one, or raise foxglove_bridge max_clients"
         return 200, ""
 
     async def _handle(self, request: web.BaseRequest) -> web.StreamResponse:
-        """Serve one request; for an accepted viewer, until it disconnects."""
+        """Serve one request. An accepted viewer is served until it disconnects."""
         code, why = self._refusal(request)
         if why:
             self.refused += 1
@@ -446,7 +446,7 @@ class FoxgloveServer:
         return []
 
     def _subscribe(self, viewer: _Viewer, number: int, channel_id: int) -> str:
-        """Subscribe a viewer; return the status text of a refusal, else an empty text. The caller holds the lock."""
+        """Subscribe a viewer; return the status text of a refusal, or an empty text. The caller holds the lock."""
         channel = next((each for each in self._channels.values() if each.id == channel_id), None)
         if channel is None:
             return protocol.status(protocol.ERROR, f"Unknown channel {channel_id}")

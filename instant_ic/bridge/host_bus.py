@@ -25,8 +25,8 @@ BRIDGES = ("host_bridge", "zenoh_gateway")
 """Nodes that republish messages from elsewhere. Their messages are not exported, to avoid echoes."""
 
 OLD_NEWS_NS = 1_000_000_000
-"""A message on a shared state that is older than the latest by more than this is dropped; clock errors are smaller. A
-false Bool must be newer by this than every stop of another publisher: else their order is uncertain, and a stop holds.
+"""A message on a shared state is dropped if the newest is newer by more than this; clock errors are smaller. A false
+Bool must be newer by this than every stop of another publisher. Otherwise their order is uncertain, and the stop holds.
 """
 
 MAX_LATCHED = 64
@@ -38,7 +38,7 @@ class ExportedTopics:
 
     Args:
         rules: topics to export, by name without namespace.
-        link: their destination.
+        link: link that carries the topics to the other hosts.
         on_trouble: called with topic and error text when a topic cannot be exported.
     """
 
@@ -100,12 +100,12 @@ class _Imported:
 
 
 class ImportedTopics:
-    """Publishes the messages of the link on this host, as on the other host.
+    """Publishes messages that arrive over the link on this host's bus, unchanged.
 
     Args:
         rules: topics to import, by name without namespace.
         on_trouble: called with topic and error text when a topic cannot be published here.
-        holder: returns who has the robot's lease, as the arbiter reports it; empty: nobody, or unknown.
+        holder: returns the holder of the robot's lease as the arbiter reports it; empty if there is none or unknown.
     """
 
     def __init__(
@@ -129,7 +129,7 @@ class ImportedTopics:
         return topic
 
     def take(self, peer: str, arrived: Arrived) -> None:
-        """Publish a message of a host; called on the link's thread: commands do not wait for the node's thread."""
+        """Publish a message of a host. Called on the link's thread, so commands do not wait for the node's thread."""
         announce = arrived.announce
         topic = self.open(announce)
         if announce.topic == DRIVE:
@@ -174,13 +174,13 @@ class ImportedTopics:
                 self._publish(topic.publisher, arrived)
 
     def _not_driving(self, peer: str, origin: str) -> str:
-        """Why a release by a node of a host does not count: another node of a host drives; empty if it may."""
+        """Return why this node may not release: another bridged node drives. Empty if it may."""
         here, holder = f"{self._node.node_name}/", self._holder()
         theirs = f"{here}{sender_name(peer, origin)}/"
         return f"only {holder} may release" if holder.startswith(here) and not holder.startswith(theirs) else ""
 
     def _advertise(self, name: str, topic: _Imported) -> None:
-        # The bridge itself publishes /diagnostics and the like; the other hosts' messages share that publisher.
+        # The bridge has its own publisher of /diagnostics and the like; the other hosts' messages share it.
         publisher = next((p for p in self._node.publishers if p.topic == self._node.resolve(name)), None)
         if publisher is None:
             try:
@@ -220,10 +220,10 @@ class ImportedTopics:
 
 
 def _signed(peer: str, arrived: Arrived) -> Arrived:
-    """Return a drive command that names host, node and client that sent it, whatever they claim to be.
+    """Return a drive command whose frame id names the host and node that sent it, whatever it claimed.
 
     Raises:
-        MessageError: it is not readable.
+        MessageError: the command cannot be decoded.
     """
     announce = arrived.announce
     message = deserialize(arrived.payload, announce.type_name)
@@ -232,7 +232,7 @@ def _signed(peer: str, arrived: Arrived) -> Arrived:
 
 
 def _outdated(topic: _Imported, source: tuple[str, str], release: bool, born_ns: int) -> str:
-    """Why a message on a shared state comes too late; empty if it does not."""
+    """Return why a message on a shared state is too late; empty if it is in time."""
     if not release:
         return "outdated" if born_ns < topic.newest_ns - OLD_NEWS_NS else ""
     if any(born_ns < at_ns + OLD_NEWS_NS for other, at_ns in topic.stops.items() if other != source):
@@ -245,5 +245,5 @@ def _note_stop(topic: _Imported, source: tuple[str, str], release: bool, born_ns
         topic.stops.clear()
         return
     topic.stops[source] = born_ns
-    if len(topic.stops) > 2:  # the newest stop of another publisher than the one that releases is among them
+    if len(topic.stops) > 2:  # two suffice: whoever releases, one of them is the newest stop of another publisher
         del topic.stops[min(topic.stops, key=lambda each: topic.stops[each])]

@@ -26,7 +26,7 @@ class ClockFilter:
     """Clock offset from exchanges of time stamps.
 
     The estimate uses the exchange with the shortest round trip in the last ``window_s``: it waited least in queues, and
-    its offset is wrong by at most half its round trip. Both clocks must never step (``CLOCK_MONOTONIC``).
+    its offset is wrong by at most half its round trip. Neither clock may ever step (``CLOCK_MONOTONIC``).
 
     Args:
         window_s: long enough to include an idle moment, short enough that quartz drift (50 ppm) does not matter.

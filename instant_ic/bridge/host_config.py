@@ -15,11 +15,11 @@ class HostBridgeConfig:
     """Parameters.
 
     Attributes:
-        listen: robot: tcp://0.0.0.0:7450.
-        connect: station: tcp://ADDRESS:7450.
-        peer: station: name of the robot among the allowed hosts; empty: the only one.
+        listen: on the robot: address to listen on, tcp://0.0.0.0:7450.
+        connect: at the station: address of the robot, tcp://ADDRESS:7450.
+        peer: at the station: name of the robot among the allowed hosts; empty: the only allowed host.
         keys: key folder; empty: $XDG_CONFIG_HOME/instant_ic/keys.
-        driver: robot: host that drives; empty: the first driver connected, until it leaves.
+        driver: on the robot: host that drives; empty: the first driver that connects, until it leaves.
         max_offset_ms: ms; clock offset between the hosts above which the bridge warns.
         to_station: topics that the robot sends, one per line (form: docs/bridge.md).
         to_robot: topics that a station sends; not /cmd_vel, which only the arbiter publishes.

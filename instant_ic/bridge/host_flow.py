@@ -30,9 +30,9 @@ class Item:
     Attributes:
         payload: CDR bytes.
         publish_ns: time of the first publication.
-        born_ns: the same by this host's monotonic clock, which is never set.
+        born_ns: the same time by this host's monotonic clock, which is never set.
         sequence: sequence number on a queued channel; on other channels it is assigned when the message leaves.
-        wall_time: whether ``publish_ns`` is the machine's time.
+        wall_time: whether ``publish_ns`` is the machine's time of day, not simulated time.
     """
 
     payload: bytes = field(repr=False)
@@ -48,7 +48,7 @@ class Channel:
 
     Attributes:
         number, origin, type_name, digest, qos: see :class:`Announce`.
-        rule: how it goes over the link.
+        rule: rate, lane and age limit of the topic.
         latched: send the last value to every host that connects.
         queued: send every message; otherwise only the newest.
         sequence: number of the newest message of a queued channel.
@@ -150,7 +150,7 @@ class Outbox:
     """Everything that waits for one host.
 
     Args:
-        wants: topic → most messages per second that the other host takes (0: all); others are not sent.
+        wants: topic → most messages per second that the other host takes (0: all); other topics are not sent.
         window: limits the bytes in flight.
         sequences: channel → number of the last message sent. It is kept across the links with one host, so that the
             host can detect the messages that a broken link lost.

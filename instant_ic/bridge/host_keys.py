@@ -253,7 +253,7 @@ def _writing(path: Path) -> Iterator[None]:
 
 
 def _text(path: Path, closed: int, verb: str) -> str | None:
-    """Text of a file, None if it is missing; refused if others have one of the mode bits ``closed``."""
+    """Return the text of a file; None if it is missing. A file with any of the mode bits ``closed`` is refused."""
     try:
         with path.open() as file:
             mode = os.fstat(file.fileno()).st_mode

@@ -44,7 +44,7 @@ class Stranger:
 
 @dataclass(frozen=True)
 class LinkProblem:
-    """Why there is no link; empty once there is one again."""
+    """The reason why there is no link; an empty text once the link is back."""
 
     text: str
 
@@ -172,7 +172,7 @@ class HostLink(ABC):
             qos: name of the preset, whether latched, whether reliable.
             payload: CDR bytes; copied if a host takes them.
             publish_ns: time of publication.
-            wall_time: whether that is the machine's time, not simulated time.
+            wall_time: whether ``publish_ns`` is the machine's time of day, not simulated time.
 
         Raises:
             ValueError: the type is unknown on this host.

@@ -189,12 +189,12 @@ class ListeningLink(HostLink):
             self._send_frame(route, word.encode())
             return None
         for old_route, old in list(self._by_route.items()):
-            if old.peer.public_key == peer.public_key:  # it restarted, or lost a link before we noticed
+            if old.peer.public_key == peer.public_key:  # the host restarted, or lost its link before we noticed
                 self._handle(old, old.session.end("replaced", "a newer link uses the same key", inform=True))
                 self._send(old_route, old)
         connection = Connection(peer, self._new_session(peer, connecting=False, may_send=peer.role == "driver"))
         connection.address = str(frame.get("Peer-Address"))
-        with contextlib.suppress(zmq.ZMQError):  # libzmq may be built without it: its own heartbeats then end the rest
+        with contextlib.suppress(zmq.ZMQError):  # libzmq may lack SRCFD; its own heartbeats then end a dead connection
             connection.file = int(frame.get(zmq.SRCFD))
             connection.remote = _remote_of(connection.file)
         self._by_route[route] = connection

@@ -48,7 +48,7 @@ class _Json:
         hints = get_type_hints(cls)
         names = [f.name for f in fields(cls)]  # type: ignore[arg-type]
         if isinstance(content, dict) and "version" in names and content.get("version") != VERSION:
-            # Another version may greet with other fields; the reply needs only the ones known here.
+            # Another version may greet with other fields; the reply needs only the known ones.
             content = {name: content.get(name) for name in names}
             kinds = {name: get_origin(hints[name]) or hints[name] for name in names}
             content = {n: value if isinstance(value, kinds[n]) else kinds[n]() for n, value in content.items()}
@@ -235,12 +235,12 @@ class Data:
         channel: see :class:`Announce`.
         sequence: number of the message, from 1; a gap is a loss.
         publish_ns: time of the first publication.
-        born_ns: the same by the sending host's monotonic clock.
+        born_ns: the same time by the sending host's monotonic clock.
         sent_ns: time at which this chunk leaves, by the same clock.
         total: bytes of the message.
         offset: position of this chunk in the message.
         lane: the sender's lane, as an index of :data:`LANES`; the messages of a lane do not overlap.
-        wall_time: whether ``publish_ns`` is the machine's time (a simulated clock is the same on both hosts).
+        wall_time: whether ``publish_ns`` is the machine's time of day (a simulated clock is the same on both hosts).
     """
 
     KIND: ClassVar[int] = 19

@@ -22,11 +22,11 @@ class LinkReport:
 
     Args:
         diagnose: sets a diagnosis, as :meth:`Node.diagnose`.
-        listed: topics of this host's lists.
+        listed: topics on this host's lists.
 
     Attributes:
-        problem: why no link is possible; empty while it is.
-        lost_link: how the last link ended.
+        problem: reason why no link is possible; empty if there is none.
+        lost_link: text on how the last link ended.
     """
 
     def __init__(self, link: HostLink, diagnose: Callable[..., None], listed: set[str]) -> None:
@@ -46,7 +46,7 @@ class LinkReport:
         self._diagnose(f"topic {topic}", ERROR, text)
 
     def clear_troubles(self) -> None:
-        """Take back the reports on topics, after a new link."""
+        """Withdraw the reports on topics after a reconnect."""
         for topic in self._troubled:
             self._diagnose(f"topic {topic}", OK, "no fault since the newest link")
         self._troubled.clear()
@@ -94,7 +94,7 @@ class LinkReport:
 
 
 def judge_clock(offset_ms: float, rtt_ms: float, max_offset_ms: float) -> tuple[int, str]:
-    """Level and text for a clock that is ``offset_ms`` ahead: stamps in messages are not changed on the way."""
+    """Return level and text for a clock that is ``offset_ms`` ahead; the link does not convert stamps in messages."""
     text = f"{abs(offset_ms):.1f} ms {'ahead of' if offset_ms > 0 else 'behind'} this one"
     if abs(offset_ms) <= max_offset_ms + rtt_ms / 2:  # half the round trip is uncertainty
         return OK, text
@@ -112,7 +112,7 @@ def _values(peer: PeerStatus) -> dict[str, Any]:
 
 
 def _counts(direction: str, topics: dict[str, TopicCounts]) -> dict[str, str]:
-    """One line per topic: what was transferred, and why the rest was not."""
+    """Return a line per topic: messages that were transferred, and why others were not."""
     lines = {}
     for topic, counts in sorted(topics.items()):
         parts = [f"{counts.messages} messages", f"{counts.bytes} bytes"]

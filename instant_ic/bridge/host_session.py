@@ -39,10 +39,10 @@ MAX_MESSAGE = 64 << 20
 """Largest message that is reassembled, in bytes."""
 
 MAX_CHANNELS = 1024
-"""Most channels that the other host may announce on one link; a robot has some hundred."""
+"""Most channels that the other host may announce on one link; a robot has a few hundred."""
 
 SHARED_BYTES_PER_S, SHARED_BURST = 512 << 10, 2 << 20
-"""Bytes of shared topics from a host that does not drive, apart from stops; ten nodes' reports are some 20 kB/s."""
+"""Rate and burst of shared topics from a host that does not drive, except stops; reports of ten nodes take 20 kB/s."""
 
 MAX_NAME = 128
 MAX_NOTICES = 16
@@ -409,7 +409,7 @@ class Session:
             self._replies.append(Welcome(VERSION, self.side.name, self.side.instance, self._wants()))
         wants = message.wants
         for topic, rate in wants.items():
-            # The period of a tiny rate is no number of nanoseconds.
+            # The period of a tiny rate would be infinite.
             if not isinstance(rate, (int, float)) or isinstance(rate, bool) or not (rate == 0 or 1e-6 < rate < 1e6):
                 raise HostProtocolError(
                     f"{type(message).__name__}: rate of {topic} must be a number >= 0 (got {rate!r})"
@@ -438,7 +438,7 @@ class Session:
         elif not self.may_send:
             reason = f"{self.peer_name} may only watch {self.side.name} (role viewer)"
         elif announce.type_name != (wanted := COMMANDS.get(announce.topic, announce.type_name)):
-            # The first host that announces a topic gives it its type: it must not keep others from stopping the robot.
+            # The first announcement sets a topic's type. A wrong type must not keep others from stopping the robot.
             reason = f"{announce.topic} must be {wanted} (got {announce.type_name})"
         else:
             try:
@@ -454,7 +454,7 @@ class Session:
         self._incoming[announce.channel] = _Incoming(announce, rule or TopicRule("/none"), counts, reason)
         if reason:
             return self.refuse(announce, reason)
-        # A host that does not drive gives no topic its type.
+        # A host that does not drive must not set a topic's type.
         return [Announced(announce)] if self.drives or rule is None or rule.shared else []
 
     def refuse(self, announce: Announce, reason: str) -> list[Event]:
@@ -518,7 +518,7 @@ class Session:
         _remember(self.memory.received, key, data.sequence)
         born_ns = min(data.born_ns - self.clock.offset_ns, now)  # by our monotonic clock
         rule = incoming.rule
-        # Before its age is judged: an old command too shows what the operator does.
+        # Checked before the age, because an old command also shows whether the operator holds a key.
         held = not rule.shared and self._is_held(key, announce, payload, now)
         if rule.max_age_s and now - born_ns > rule.max_age_s * 1e9:
             counts.expired += 1
@@ -531,7 +531,7 @@ class Session:
         arrived = Arrived(announce, payload, publish_ns, born_ns)
         if held or (not self.drives and not self._shares(arrived, rule, now)):
             counts.not_driving += 1
-            # A refused release is gone: the lease must not end an emergency stop when it is handed over.
+            # A refused release is dropped for good: handing over the lease must not end an emergency stop.
             if announce.qos == "latched" and not rule.shared and not held:
                 incoming.kept = arrived, data.born_ns
                 kept = sum(len(each.kept[0].payload) for each in self._incoming.values() if each.kept is not None)
@@ -541,16 +541,17 @@ class Session:
         return self._deliver(incoming, arrived, data.born_ns)
 
     def _shares(self, arrived: Arrived, rule: TopicRule, now: int) -> bool:
-        """Return whether a host that does not drive may send this message: a shared topic, no release, no flood."""
+        """Return whether a host that does not drive may send this: a shared topic, no release, within the rate."""
         announce, payload = arrived.announce, arrived.payload
         if not rule.shared or releases(announce.type_name, payload):
             return False
         return announce.topic in COMMANDS or self._shared.take(now / 1e9, len(payload) + DATA_OVERHEAD)
 
     def _is_held(self, key: tuple[str, str, str], announce: Announce, payload: bytes | bytearray, now: int) -> bool:
-        """Return whether the controls were held since before this host drove: no robot starts under a held key.
+        """Return whether the operator has held a key since before the other host drove; no robot starts under it.
 
-        Letting go is a zero, or a silence that no link outlives: a shorter one may be a stall of the network.
+        A zero command counts as letting go, and so does a silence longer than any link survives. A shorter silence may
+        be a stall of the network.
         """
         held, last_ns = self.memory.held, self.memory.held.get(key)
         if self.drives and last_ns is None:
@@ -569,7 +570,7 @@ class Session:
     def _deliver(self, incoming: _Incoming, arrived: Arrived, born_ns: int) -> list[Event]:
         announce, counts = incoming.announce, incoming.counts
         if announce.qos == "latched":
-            # A value that a new link repeats is not new: an emergency stop released long ago must not release one that
+            # A new link repeats the latched values. An old release among them must not end an emergency stop that
             # another host has set since.
             key = (self.peer_instance, announce.topic, announce.origin)
             if self.memory.latched.get(key) == born_ns:

@@ -32,10 +32,10 @@ def moves(type_name: str, payload: bytes | bytearray) -> bool:
 
 @dataclass(frozen=True)
 class TopicRule:
-    """How one topic goes over the link; written as ``/scan rate_hz=5 lane=state``.
+    """Rate, lane and age limit of one topic on the link; written as ``/scan rate_hz=5 lane=state``.
 
     Attributes:
-        topic: its name, without namespace.
+        topic: name of the topic, without namespace.
         rate_hz: most messages per second, keeping the newest; 0 sends all.
         lane: priority class, one of :data:`~.host_protocol.LANES`.
         max_age_s: messages older than this since publication are dropped and counted, on either side; 0 keeps all.
@@ -117,7 +117,7 @@ class TopicCounts:
         expired: older than ``max_age_s``.
         overflowed: dropped from the full queue of a reliable topic.
         lost: gaps in the sequence, on the receiving side.
-        not_driving: from a host that does not drive, or that must let go of the controls first.
+        not_driving: from a host that does not drive, or whose operator must let go of the controls first.
     """
 
     messages: int = 0

@@ -1,8 +1,8 @@
 """rmw_zenoh's conventions as strings and bytes: data keys, attachments, liveliness tokens (rmw_zenoh, docs/design.md).
 
 ROS 2 nodes (Jazzy and newer) on rmw_zenoh exchange CDR, as our bus does. A program that follows these conventions
-takes part in their graph. Nothing here needs Zenoh itself. Each function raises :class:`FormatError` for what does not
-follow them.
+takes part in their graph. Nothing here needs Zenoh itself. Each function raises :class:`FormatError` for text or bytes
+that do not follow the conventions.
 """
 
 from __future__ import annotations
@@ -20,11 +20,11 @@ GID_SIZE = 16
 
 SENDER_SIZE = 8
 """Leading bytes of the id that all publishers of one of our sessions share. They show that a drive command and the
-release of an emergency stop come from the same sender. In ids of ROS 2 publishers all bytes are individual."""
+release of an emergency stop come from the same sender. ROS 2's own publishers share no bytes of their ids."""
 
 QOS_TEXT = {SENSOR: "2::,5:,:,:,,", RELIABLE: "::,10:,:,:,,", LATCHED: ":1:,1:,:,:,,"}
-"""Tokens' QoS of a preset, ``reliability:durability:history,depth:deadline:lifespan:liveliness``; empty is a default.
-2 is best effort, 1 is transient local."""
+"""QoS of each preset in a token, ``reliability:durability:history,depth:deadline:lifespan:liveliness``. An empty field
+is the default; reliability 2 is best effort, durability 1 is transient local."""
 
 _ATTACHMENT = struct.Struct("<qqB16s")
 _DDS_TYPE = re.compile(r"(\w+)::(\w+)::dds_::(\w+)_\Z")

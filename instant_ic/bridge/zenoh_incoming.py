@@ -59,11 +59,11 @@ class _ImportedTopic:
         topic: name of the topic on the bus.
         type_name: ``std_msgs/msg/String``.
         publisher: publisher on the bus.
-        static: newest static transform of each child frame, if the topic is latched transforms. Several nodes send one
-            message each, but our publisher keeps one latched value: their union.
+        static: newest static transform of each child frame if the topic has latched transforms, else None. Several
+            nodes send one message each, but our publisher keeps one latched value and therefore publishes the union.
         declared: subscriber and token in the ROS graph.
         sources: publishers in the ROS graph by session and entity.
-        gone_s: time at which the last of them left; None while there are some, or before the first.
+        gone_s: time at which the last of the sources left; None while there are some, and before the first.
         sequences: newest sequence number of each publisher.
         count, lost: messages passed on, and messages lost on the way.
         malformed: messages refused because they have no readable attachment.
@@ -124,11 +124,11 @@ class Incoming:
     Args:
         node: the gateway.
         own: the gateway in the ROS graph.
-        prefix: stands before the names of topics in the ROS graph: ``/robot1``, or empty.
+        prefix: text before the names of topics in the ROS graph: ``/robot1``, or empty.
         subscribe: names or patterns of topics, by local names; a topic exists once a publisher appears.
-        commands: those of :data:`COMMANDS` that are accepted.
+        commands: topics of :data:`COMMANDS` that are accepted.
         gate: checks commands.
-        no_commands: why only an emergency stop is accepted as a command; empty if the link is secure.
+        no_commands: reason why only an emergency stop is accepted as a command; empty if the link is secure.
     """
 
     def __init__(
@@ -217,9 +217,9 @@ class Incoming:
         imported.gone_s = None
 
     def _open(self, topic: str, type_name: str, qos: QoS) -> _ImportedTopic:
-        """Subscribe in the ROS graph to messages of other sessions; those of another definition have another key."""
+        """Subscribe in the ROS graph to other sessions' messages. Another definition of the type has another key."""
         name = message_type(type_name).__msgtype__
-        # The gateway itself publishes /heartbeat and the like; other nodes' messages share that publisher.
+        # The gateway has its own publisher of /heartbeat and the like; other nodes' messages share it.
         publisher = next((p for p in self._node.publishers if p.topic == topic), None)
         if publisher is None:
             publisher = self._node.publisher_raw(topic, name, qos)
@@ -270,7 +270,7 @@ class Incoming:
             imported.publisher.publish_bytes(passed, attachment.source_ns)
 
     def _check(self, imported: _ImportedTopic, payload: bytes, attachment: Attachment) -> bytes | memoryview | Refusal:
-        """Return the command to publish, or why not; a drive command names its sender, whatever that claims to be."""
+        """Return the command to publish, or its refusal. A drive command is marked with its actual sender."""
         gate, age_s, steady_ns = self._gate, (time.time_ns() - attachment.source_ns) / 1e9, time.monotonic_ns()
         try:
             message = deserialize(payload, COMMANDS[imported.topic])
@@ -295,7 +295,7 @@ class Incoming:
 
     def _left(self, imported: _ImportedTopic, source: tuple[str, int]) -> None:
         """Handle a ROS publisher that is gone; if it was the last driver, stop the robot."""
-        with self._gate_lock:  # its command in transit must not follow the zero
+        with self._gate_lock:  # a command in transit must not follow the zero
             imported.sources.remove(source)
             if imported.sources:
                 return

@@ -21,7 +21,7 @@ from instant_ic.msg import MessageError, message_type, type_hash
 GRACE_S = 3.0
 """Time in seconds that a vanished topic is kept, for example while its node restarts."""
 
-_HEARTBEAT_S = 0.5  # lets a late reader of a latched topic, or one with losses, find what it missed, as in rmw_zenoh
+_HEARTBEAT_S = 0.5  # shows a late or lossy reader of a latched topic which message it missed, as in rmw_zenoh
 
 
 def known_hash(type_name: str) -> str | None:
@@ -36,7 +36,7 @@ def parse_publish(entries: Sequence[str]) -> dict[str, int]:
     """Parse lines such as ``/lidar/points rate_hz=3``; return pattern → shortest period in ns (0: no limit).
 
     Raises:
-        ValueError: a line has another form.
+        ValueError: a line is malformed.
     """
     periods = {}
     for entry in entries:
@@ -68,7 +68,7 @@ class RosPublisher:
         session = node.session
         key = data_key(session.domain, topic, type_name, type_hash)
         reliability = package.Reliability.RELIABLE if qos.reliable else package.Reliability.BEST_EFFORT
-        # As in rmw_zenoh: a link that cannot keep up loses messages, which the reader counts, but never blocks us.
+        # As in rmw_zenoh, a link that cannot keep up drops messages instead of blocking us; the reader counts the loss.
         options = {"congestion_control": package.CongestionControl.DROP, "reliability": reliability}
         if qos.latched:
             self._publisher = package.ext.declare_advanced_publisher(
@@ -107,7 +107,7 @@ class _Mirror:
         """Return whether a rate limit drops a message that arrives now."""
         if now_ns < self.due_ns:
             return True
-        # Keep a fixed grid of periods, so that a limit of 3 Hz on a 10 Hz topic gives 3 Hz; no burst after a pause.
+        # On a fixed grid of periods, a limit of 3 Hz on a 10 Hz topic gives 3 Hz. A pause restarts it, without a burst.
         self.due_ns = (self.due_ns if now_ns - self.due_ns < period_ns else now_ns) + period_ns
         return False
 
@@ -130,7 +130,7 @@ class Outgoing:
     Args:
         node: the gateway.
         own: the gateway in the ROS graph.
-        prefix: put before the names of topics: ``/robot1``, or empty.
+        prefix: text before the names of topics in the ROS graph: ``/robot1``, or empty.
         publish: see :func:`parse_publish`; the first matching pattern applies.
         imported: returns whether the gateway imports a topic; messages that it imported are not exported again.
 
@@ -213,7 +213,7 @@ class Outgoing:
         exported = self._topics.get(received.topic)
         if exported is None or self._came_in(received.topic, received.publisher):
             return
-        # A message may come before the next look at the registry.
+        # A publisher's first message may arrive before the next look at the registry.
         mirror = self._mirror(received.topic, received.publisher, received.type_name, exported.subscription.raw.qos)
         if mirror is None:
             return

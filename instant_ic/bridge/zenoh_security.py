@@ -15,7 +15,7 @@ _LOOPBACK_LINKS = ("tcp", *_TLS_LINKS)
 
 
 def command_security(config: Any, loopback_allowed: bool) -> tuple[int, str]:
-    """Return the diagnosis of the operators' commands over a configuration's links; ERROR where they must be refused.
+    """Diagnose whether a configuration's links may carry operators' commands; ERROR if commands must be refused.
 
     Args:
         config: the Zenoh configuration.

@@ -21,7 +21,7 @@ from instant_ic.util.paths import shipped_file
 DEFAULT_ROUTER = "tcp/localhost:7447"
 
 CONNECT_TIMEOUT_MS = 2000
-"""Time after which a client whose router does not answer gives up; by its own configuration it may wait forever."""
+"""Time after which a client gives up if no router answers; Zenoh's own default may wait forever."""
 
 SESSION_DEFAULTS = {
     "mode": '"peer"',
@@ -29,13 +29,13 @@ SESSION_DEFAULTS = {
     "listen/endpoints": '["tcp/localhost:0"]',
     "scouting/multicast/enabled": "false",
     "scouting/gossip/enabled": "true",
-    # The cache of a latched topic sorts by time.
+    # The cache of a latched topic sorts messages by time stamp.
     "timestamping/enabled": "{router: true, peer: true, client: true}",
 }
-"""Configuration of rmw_zenoh's sessions: peers of the router on their host, which introduces them; no multicast."""
+"""rmw_zenoh's configuration of a session: peers meet through the router on their host, without multicast."""
 
 CLIENT_DEFAULTS = {**SESSION_DEFAULTS, "mode": '"client"', "listen/endpoints": "[]"}
-"""For a router on another host: Zenoh routers do not forward messages between peers without a direct link."""
+"""Configuration for a router elsewhere; Zenoh routers do not forward messages between peers without a direct link."""
 
 ROUTER_DEFAULTS = {
     **SESSION_DEFAULTS,

@@ -44,7 +44,7 @@ class CalibrationRecording:
         base_from_lidar: (4, 4) from the transforms in the bag; None if they are missing.
         pictures: number of images in the bag.
         places: number of places in the recording.
-        moves: whether odometry was available to compensate the motion.
+        moves: True if the bag has odometry, which compensates the motion.
     """
 
     frames: list[CalibrationFrame]
@@ -212,7 +212,7 @@ def _evenly(values: list[int], most: int) -> list[int]:
 
 
 def _nearest_clouds(bag: BagReader, stamps: list[int]) -> dict[int, CalibrationCloud]:
-    """Return the revolution nearest in time to each stamp, where one is near enough."""
+    """Return the revolution nearest in time to each stamp; stamps without a near enough revolution are left out."""
     # The bag stamps messages on arrival, up to a second late on a busy machine.
     at = np.array(stamps)
     found: dict[int, CalibrationCloud] = {}

@@ -34,7 +34,7 @@ class LidarEdges:
 
 @dataclass(frozen=True)
 class FloorPlane:
-    """Floor in the LiDAR's frame: upward normal (3,), and height in metres with normal · p = height for its points."""
+    """Floor in the LiDAR's frame: upward normal (3,), and height in metres; normal · p = height for floor points p."""
 
     normal: NDArray[np.float64]
     height: float
@@ -66,7 +66,7 @@ def find_floor(points: Floats, most_tilt_deg: float = 15.0, seed: int = 0) -> Fl
     on_it = low[np.abs(low @ normal - height) < 0.03]
     near, far = np.quantile(np.hypot(on_it[:, 0], on_it[:, 1]), (0.1, 0.9))
     if far - near < 0.2:
-        return None  # a single ring on surrounding walls, which is always planar
+        return None  # probably a single ring on the walls around; any single ring is planar
     centre = on_it.mean(axis=0)
     normal = np.linalg.svd(on_it - centre, full_matrices=False)[2][2]
     normal *= np.sign(normal[2])
@@ -103,7 +103,7 @@ def _between(points: Floats, range_m: Floats, a: NDArray[np.intp], b: NDArray[np
 
 
 def _jumps(points: Floats, range_m: Floats, ring: NDArray[np.int64], azimuth: Floats) -> Floats:
-    """Find the near side of depth discontinuities along a ring; that surface ends there in the image, too."""
+    """Find the near side of depth discontinuities along a ring, where the near surface ends in the image too."""
     a = np.arange(max(len(range_m) - 1, 0))
     b = a + 1
     near = np.minimum(range_m[a], range_m[b])
@@ -159,8 +159,8 @@ def _across_rings(
 def picture_edges(rgb: NDArray[np.uint8], sigma_px: float) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Compute the strengths of a panorama's (H, W, 3) vertical and horizontal edges, (H, W), over their mean.
 
-    Computed from the logarithm of the brightness, so that dark and bright corners count alike. The strongest twentieth
-    is clipped, so that a lamp does not outweigh everything else.
+    Strengths are gradients of the logarithmic brightness, so that dark and bright corners count alike. The strongest
+    twentieth is clipped, so that a lamp does not outweigh everything else.
     """
     import cv2
 

@@ -24,8 +24,8 @@ _SECTORS = 16
 AXES = ("x", "y", "z", "roll", "pitch", "yaw")
 _WEIGHTS = {"jump": 1.0, "shade": 1.0, "floor": 0.5, "shade_across": 0.25}
 _SYSTEMATIC = np.array([0.01] * 3 + [math.radians(0.1)] * 3)
-"""Systematic error that the scatter does not show: a skirting board in front of its wall, a rounded edge.
-Measured."""
+"""Measured systematic error, which the scatter does not show. Causes are skirting boards in front of their walls and
+rounded edges."""
 _PLACES_FOR_HEIGHT, _UNCHECKED_HEIGHT = 3, 5.0
 """With fewer places, the upper edge of a skirting board can pass for the foot of its wall; z then gets an additional
 standard deviation of this many units."""
@@ -73,7 +73,7 @@ class Calibration:
         constrained: whether the recording constrains each of them, (6,); the others keep their given values.
         score_before, score_after: mean strength of the image edges under the LiDAR's edges; 1 is the level of chance.
         edges: number of edge points used, by cue.
-        yaw_rival: score of the best yaw more than 20 degrees away divided by the best score, both above chance; near 1
+        yaw_rival: score of the best yaw more than 20 degrees away divided by the best score, both above chance. Near 1,
             the place looks alike in two directions.
     """
 
@@ -178,7 +178,7 @@ def calibrate(
     covariance = _covariance(level, found)
     if len({frame.place for frame in frames}) < _PLACES_FOR_HEIGHT:
         covariance[2, 2] += _UNCHECKED_HEIGHT**2
-    for other in rivals:  # either may be true: the selected pose is off by nothing or by the whole difference
+    for other in rivals:  # either pose may be the true one: the error is nothing or the whole difference
         shift = correction(found, other) / _UNIT
         covariance += 0.5 * np.outer(shift, shift)
     units = correction(start, found) / _UNIT
@@ -247,8 +247,8 @@ def _above_chance(level: _EdgeLevel, before: Matrix, after: Matrix) -> tuple[flo
     ratio = level.score(after) / chance
     if ratio < 1.05:
         raise CalibrationError(
-            f"the LiDAR's edges fit the image edges nowhere better than by chance ({ratio:.2f} times). Record in a "
-            "lit, furnished room, and check that the stamps of images and LiDAR match."
+            f"no pose aligns the LiDAR's edges with the image edges better than chance ({ratio:.2f} times). Record in "
+            "a lit, furnished room, and check that the stamps of images and LiDAR match."
         )
     return level.score(before) / chance, ratio
 
@@ -296,7 +296,7 @@ def _climb(level: _EdgeLevel, start: Matrix, found: Matrix) -> Matrix:
         return -level.score(_moved(start, units)) / base + 0.005 * float(((units / reach) ** 2).sum())
 
     def slope(units: Floats) -> NDArray[np.float64]:
-        # A third of a unit: smaller differences would show the steps of bilinear interpolation.
+        # A third of a unit, because smaller differences would show the steps of bilinear interpolation.
         steps = np.eye(6) / 3
         return np.array([(cost(units + step) - cost(units - step)) * 1.5 for step in steps])
 
@@ -306,7 +306,7 @@ def _climb(level: _EdgeLevel, start: Matrix, found: Matrix) -> Matrix:
 
 
 def _among_rivals(level: _EdgeLevel, start: Matrix, found: Matrix) -> tuple[Matrix, list[Matrix]]:
-    """Select the maximum, and return other maxima that fit as well because parallel edges can be confused.
+    """Select the maximum; also return other maxima that fit as well, because parallel edges can be confused.
 
     With a camera height that is too low, the foot of a wall falls on the upper edge of its skirting board. From several
     places only one of the two heights fits; from one place both may. Among maxima that the scatter over the blocks

@@ -12,7 +12,7 @@ from instant_ic.geometry.poses import Matrix, transform_points
 
 
 def overlay(frame: CalibrationFrame, camera_from_lidar: Matrix, width: int = 1600) -> NDArray[np.uint8]:
-    """Render points by range (near bright, far dark) on a dimmed panorama, (width / 2, width, 3) RGB."""
+    """Render points, near ones bright and far ones dark, on a dimmed panorama; (width / 2, width, 3) RGB."""
     import cv2
 
     picture = cv2.resize(frame.rgb, (width, width // 2), interpolation=cv2.INTER_AREA)

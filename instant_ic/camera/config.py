@@ -116,4 +116,4 @@ class ThetaCameraConfig:
                 "into a file, run chmod 600 on it, and set password_file"
             )
         if "{password}" in self.url and not self.password_file:
-            raise ValueError("url has a place for a password: set password_file")
+            raise ValueError("url contains {password}, but password_file is empty: set password_file")

@@ -39,7 +39,7 @@ def open_camera(config: ThetaCameraConfig, now_ns: Callable[[], int]) -> Camera:
 
 
 def _credentials(file: str) -> tuple[str, str]:
-    """Return user and password of a file; both empty without one."""
+    """Return the user and password in a file; both are empty without a file."""
     if not file:
         return "", ""
     path = Path(file).expanduser()

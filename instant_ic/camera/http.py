@@ -16,7 +16,7 @@ from requests.auth import HTTPDigestAuth
 from instant_ic.camera.source import CameraError
 
 MOST_REPLY_BYTES = 256 << 10
-"""Largest reply other than the preview; the camera's longest has a few thousand bytes."""
+"""Largest reply other than the preview; the camera's longest reply has a few thousand bytes."""
 
 
 class _DeadlineSocket(socket.socket):

@@ -10,14 +10,14 @@ from instant_ic.util.repeats import RepeatWatch
 _EMPTY_BYTES = 0.05
 """Bytes per pixel below which an image may be empty; images of a place have several times as much."""
 _EMPTY_SPREAD = 2.0
-"""Standard deviation of each colour, of 255, up to which an image at an eighth of its size shows nothing."""
+"""Largest standard deviation of each colour, 0 to 255, of an empty image, after reduction to an eighth of its size."""
 
 
 class LiveImages:
     """Liveness of a device's images, taken one after the other.
 
     Attributes:
-        fault: text that names the fault of the newest image and what to do; empty while the images are live.
+        fault: fault of the newest image and the remedy, as text; empty while the images are live.
         withheld: number of images that were not live.
     """
 

@@ -207,7 +207,7 @@ class ThetaCamera(Camera):
         self._parser = PreviewParser()
 
     def connect(self) -> str:
-        """Set the camera up, if it is not set up already, start its preview, and return model, firmware and format."""
+        """Set the camera up if needed, start its preview, and return a text with model, firmware and format."""
         self._end_preview()
         info = self.client.info()
         model, firmware = (str(info.get(key, "unknown"))[:_MOST_TEXT] for key in ("model", "firmwareVersion"))
@@ -222,7 +222,7 @@ class ThetaCamera(Camera):
     def _set_up(self, firmware: str) -> Format:
         """Set the options that are not set already, and return the preview format.
 
-        A format that the firmware refused is not asked for again: each setting delays the preview.
+        A format that the firmware has refused is not requested again, because each setting delays the preview.
         """
         config = self.config
         wanted = (config.width, config.height, config.rate_hz)
@@ -242,12 +242,12 @@ class ThetaCamera(Camera):
                 self._refused.add((firmware, choice))
             else:
                 break
-        # If started sooner, the preview has the previous format or stops at once.
+        # A preview that is started sooner has the previous format or stops at once.
         self.client.sleep(config.settle_s)
         return choice
 
     def read(self) -> Frame:
-        """Return the newest complete image; the camera ends the preview when it shoots or changes its mode."""
+        """Return the newest complete image. The camera ends the preview when it shoots or changes its mode."""
         response, session = self._response, self._session
         if response is None or session is None:
             raise CameraError(f"{self.client.url}: not connected; call connect() first")

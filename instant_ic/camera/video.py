@@ -89,7 +89,7 @@ class VideoCamera(Camera):
             self._hung.append(reader)
 
     def _wait(self, timeout_s: float, otherwise: str) -> Any:
-        """Return the reader's answer; abandon it if there is none in time, or if the camera is cancelled."""
+        """Return the reader's answer. Abandon the reader if it does not answer in time or the camera is cancelled."""
         assert self._reader is not None
         try:
             return self._reader.answer(timeout_s, self.cancelled)
@@ -114,7 +114,7 @@ class VideoCamera(Camera):
             parameters = [cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, timeout_ms, cv2.CAP_PROP_READ_TIMEOUT_MSEC, timeout_ms]
         # OpenCV takes the time-out of devices from here, in whole seconds, once in a process; the default is 10 s.
         os.environ.setdefault("OPENCV_VIDEOIO_V4L_SELECT_TIMEOUT", str(math.ceil(self.config.read_timeout_s)))
-        if self._source != self.url:  # OpenCV logs an address that it cannot open, with its password
+        if self._source != self.url:  # OpenCV would log an address that it cannot open, including its password
             cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
         capture = cv2.VideoCapture(source, cv2.CAP_ANY, parameters)
         if not capture.isOpened():
@@ -129,10 +129,10 @@ class VideoCamera(Camera):
 
 
 class _Reader(threading.Thread):
-    """Thread that opens a capture, reads an image each time it is asked, and releases the capture at its end.
+    """Thread that opens a capture, reads an image on each request, and finally releases the capture.
 
     Args:
-        open_capture: function that returns the capture and its description, which is the first answer.
+        open_capture: function that returns the capture and its description; the description is the first answer.
         stamp_ns: clock of the images.
     """
 
@@ -166,7 +166,7 @@ class _Reader(threading.Thread):
         """Return the next answer.
 
         Raises:
-            TimeoutError: none in time, or cancelled.
+            TimeoutError: no answer came in time, or the camera was cancelled.
         """
         until_s = time.monotonic() + timeout_s
         while not cancelled.is_set() and (left_s := until_s - time.monotonic()) > 0.0:
@@ -181,7 +181,7 @@ class _Reader(threading.Thread):
         raise TimeoutError
 
     def end(self, timeout_s: float) -> bool:
-        """Let the thread end; return False if it hangs. A thread that has not answered yet is not waited for."""
+        """Let the thread end; return False if it hangs. Do not wait for a thread that has not answered yet."""
         self._asked.put(False)
         if not self._waiting:
             self.join(timeout_s)

@@ -148,7 +148,7 @@ class CapturePlayer:
 
     Args:
         path: capture file.
-        now_ns: clock of the stamps at the start.
+        now_ns: time at the start on the clock of the stamps.
         steady_ns: steady time of the start.
 
     Raises:
@@ -179,7 +179,7 @@ class CapturePlayer:
 
     @property
     def diagnosis(self) -> Diagnosis:
-        """Number of played and of skipped datagrams."""
+        """Return a diagnosis with the numbers of played and skipped datagrams."""
         skipped = ", ".join(f"{count} x {reason}" for reason, count in self._reader.skipped.items())
         text = f"{self._reader.datagrams} datagrams played" + (f"; left out: {skipped}" if skipped else "")
         return Diagnosis("capture", Level.WARN if skipped else Level.OK, text)

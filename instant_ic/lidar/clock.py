@@ -64,7 +64,7 @@ class DeviceClock:
         return self._device_us
 
     def shift(self, ns: int) -> None:
-        """Follow the host's clock, which was set forward."""
+        """Follow the host's clock after it was set forward."""
         self._offset_ns += ns
 
     def restart(self) -> None:

@@ -46,12 +46,12 @@ class FlatScanConfig:
     """Parameters of the flat scan: one range per direction from a revolution.
 
     Attributes:
-        min_height: lower points are not obstacles, metres above the ground (z of base_link).
-        max_height: the robot passes under higher points, metres above the ground.
+        min_height: height under which points are no obstacles, metres above the ground (z of base_link).
+        max_height: height above which the robot passes under points, metres above the ground.
         beams: number of directions over 360 degrees.
         range_min: smallest range of the scan, metres; nearer points count as too close (-inf).
-        range_max: farther points are left out of the scan, metres.
-        min_coverage: smallest measured share of the circle for a scan, 0-1.
+        range_max: largest range of the scan, metres; farther points are left out.
+        min_coverage: share of the circle, 0-1, that a revolution must have measured to give a scan.
     """
 
     min_height: Annotated[float, Plausible(-1, 0.5)] = 0.10
@@ -77,7 +77,7 @@ class Vlp16DriverConfig(ReceiverConfig):
         loop: start the capture again at its end.
         frame_id: the sensor's frame.
         lidar_mount: the sensor's pose on base_link.
-        silence_s: seconds without a packet that are an error.
+        silence_s: seconds without a packet after which the driver reports an error.
         decoder: conversion of packets to points.
         scan: conversion of points to the flat scan.
     """
@@ -94,4 +94,4 @@ class Vlp16DriverConfig(ReceiverConfig):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.source == "pcap" and not self.pcap:
-            raise ValueError("pcap must name a capture file where source is pcap (got '')")
+            raise ValueError("pcap must name a capture file if source is pcap (got '')")

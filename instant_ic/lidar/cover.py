@@ -1,8 +1,8 @@
-"""Sectors of the sensor that something covers: they return nothing, although there were returns just before.
+"""Sectors of the sensor that something covers: they had returns a moment ago and have none now.
 
 1. Compute the share of rays with a return per sector of a revolution. Ground and ceiling count too.
 2. Remember the largest share seen in each direction of the world, by odometry. The memory fades with time and distance.
-3. Mark a sector with hardly a return as covered if many are remembered there and beside it, until returns are back.
+3. Mark a sector with hardly any returns as covered if many are remembered there and beside it. New returns end this.
 """
 
 from __future__ import annotations
@@ -18,11 +18,11 @@ from instant_ic.util.diagnosis import Diagnosis, Level
 
 SECTORS = 72
 HELD, GONE, BACK = 0.25, 0.02, 0.1
-"""Shares of rays with a return: a sector that holds returns, one that holds none, and one that is free again."""
+"""Shares of rays with a return: least in a sector that held returns, most in one that lost them, least when back."""
 FADES_S, FADES_M = 2.0, 0.5
 """Time and distance after which the memory has faded to a third."""
 _LEAST_FIRINGS = 4
-"""A sector with fewer firings, of about twelve, was not measured."""
+"""A sector with fewer firings than this, of about twelve, was not measured."""
 _WIDTH_RAD = 2.0 * math.pi / SECTORS
 
 

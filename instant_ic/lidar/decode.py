@@ -42,7 +42,7 @@ _RAY_TIME_US = FIRING_PERIOD_US * np.arange(FIRINGS)[:, None] + LASER_PERIOD_US 
 """Time of each ray of a block after the first ray of the block, (2, 16)."""
 _TURN_CDEG = 36000
 _BACK_CDEG = 50
-"""Largest apparent turn backwards from one block to the next, of a head that stands."""
+"""Largest apparent backward turn of a standing head from one block to the next."""
 _MAX_STEP_CDEG = 100
 """Largest turn from one block to the next, in 0.01 degrees: 80 at 1200 rpm, the highest speed, and a margin."""
 _LONGEST_TURN_US = 200_000.0
@@ -84,9 +84,8 @@ def decode_packets(
     of its packet and rounded to the sensor's unit, 0.01 degrees. In dual return mode a ray yields its last return, then
     its strongest (or second strongest) one; two returns at the same distance yield one point.
 
-    A sensor with a limited field of view sends no blocks of the other directions, so that a packet may span them. The
-    turn rate then comes from the neighbouring blocks alone, and the blocks after the gap are later by the time of the
-    turn across it.
+    A sensor with a limited field of view sends no blocks of the other directions, so a packet may span that gap. The
+    turn rate is then computed without it, and blocks after the gap are later by the time of the turn across it.
 
     Args:
         packets: payloads, (P, 1206); all have the return mode of the first.

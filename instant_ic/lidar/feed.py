@@ -8,14 +8,14 @@ from instant_ic.lidar.sources import SourceGuard
 from instant_ic.lidar.stream import PacketStream, Revolution
 
 _SET_NS, _SET_BACK_NS = 20_000_000, -500_000_000
-"""Changes of the host's clock relative to its steady clock, between packets, from which on it counts as set."""
+"""Steps of the host's clock against its steady clock, forward and back, from which on the clock counts as set."""
 
 Packets = list[tuple[bytes, int]]
 """Payloads with their stamps."""
 
 
 class PacketFeed:
-    """Revolutions and the packets they consist of. The current revolution is dropped after a doubtful sender.
+    """Assembly of packets into revolutions. After a doubt about the sender, the revolution in progress is dropped.
 
     Attributes:
         stream: decodes the packets.
@@ -49,7 +49,7 @@ class PacketFeed:
         return self._with_packets(revolution)
 
     def _follow_host(self, ahead_ns: int) -> None:
-        """Follow a host's clock that was set forward. Delays of transport only lower ``ahead_ns``."""
+        """Follow the host's clock if it was set forward. Transport delays can only lower ``ahead_ns``."""
         raised_ns = 0 if self._ahead_ns is None else ahead_ns - self._ahead_ns
         if raised_ns > _SET_NS:
             self.stream.clock.shift(raised_ns)
@@ -57,7 +57,7 @@ class PacketFeed:
             self._ahead_ns = ahead_ns
 
     def finish(self) -> tuple[Revolution, Packets] | None:
-        """Return the rest as the last revolution, with its packets."""
+        """Return the remaining points as the last revolution, with their packets."""
         return self._with_packets(self.stream.finish())
 
     def _with_packets(self, revolution: Revolution | None) -> tuple[Revolution, Packets] | None:

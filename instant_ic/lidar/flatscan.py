@@ -14,7 +14,7 @@ from instant_ic.util.diagnosis import Diagnosis, Level
 from instant_ic.util.jit import leave_out_blas
 
 _MOTION_SAMPLES = 65
-"""Samples of the motion over a revolution; within 1.6 ms it is straight enough (1 um at 1 rad/s)."""
+"""Samples of the motion over a revolution; they are 1.6 ms apart, so the path between them is straight within 1 um."""
 
 MAX_TILT_DEG = 5.0
 """A flat scan lies in the sensor's plane. At this tilt, a point 0.7 m above or below the sensor is 6 cm off."""

@@ -1,8 +1,8 @@
 """Turn of the sensor's head from packet to packet, and the sector that a limited field of view leaves out.
 
-With a field of view limited in the sensor, no blocks come from the other directions. Time and azimuth then advance
-between two blocks of one packet, or between two packets, without a packet missing. `Head` learns the blocked sector
-from such blocks, so that lost packets can still be counted.
+A sensor with a limited field of view sends no blocks from the other directions. Time and azimuth then jump between two
+blocks of one packet, or between two packets, although no packet is missing. `Head` learns the blocked sector from these
+jumps, so that lost packets can still be counted.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ class Sector:
         return (self.start + self.width) % TURN_CDEG
 
     def within(self, start: int, turned: int) -> float:
-        """Return how far a turn from an azimuth on leads through the sector, 0.01 degrees."""
+        """Return the part of a turn that lies inside the sector, 0.01 degrees; the turn begins at ``start``."""
         begin = (start - self.start) % TURN_CDEG
         return self._passed(begin + turned) - self._passed(begin)
 
@@ -79,8 +79,8 @@ class Head:
             step_us: time since the last packet; None before the first one.
 
         Returns:
-            Time of ``step_us`` in which the sensor sent packets, in microseconds, and the turn from the last packet's
-            last block to the first one of this packet, 0.01 degrees. Both are 0 before the first packet.
+            Part of ``step_us`` during which the sensor sent packets, in microseconds, and the turn from the last block
+            of the last packet to the first block of this one, 0.01 degrees. Both are 0 before the first packet.
         """
         before, self._azimuths = self._azimuths, azimuths
         between, sent_us = 0, 0.0
@@ -112,7 +112,7 @@ class Head:
             self.blocked = None
 
     def _look_between(self, azimuth: int, turn: int) -> None:
-        """Learn a sector that begins and ends between packets; lost packets leave no such gap twice."""
+        """Learn a sector between two packets once its gap appears twice; lost packets leave no gap twice."""
         if self._step <= 0.0 or turn <= largest_step(round(self._step)):
             return
         found = self._after(azimuth, turn % TURN_CDEG)

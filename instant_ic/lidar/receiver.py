@@ -22,8 +22,8 @@ _TIMESPEC = struct.Struct("@ll")
 _MOST_AT_ONCE = 512
 """Datagrams per read from one port, so that a flood on it delays neither the other port nor the shutdown."""
 _GATHER_S = 0.005
-"""The first packet waits this long for the next ones: waking up for each of 754 packets a second costs more than
-decoding them. The kernel stamps each packet at its arrival."""
+"""Wait after a first packet for the next ones, because waking up for each of 754 packets a second costs more than
+decoding them. Stamps do not suffer: the kernel stamps each packet at its arrival."""
 
 
 class ReceiverError(OSError):

@@ -54,8 +54,8 @@ class LidarReport:
         self._partial_reported = 0
 
     def trusts(self, revolution: Revolution, steady_ns: int) -> bool:
-        """Return whether a revolution may be published; a copy, or one of a doubtful sender, is withheld."""
-        # Without a scan the robot stops; a forged or an old one could drive it into a wall.
+        """Return whether a revolution may be published; copies and revolutions of a doubtful sender are withheld."""
+        # Without a scan the robot stops. With a forged or an old scan it could drive into a wall.
         points = revolution.points
         new = self._repeats.is_new(*(points[name].tobytes() for name in ("x", "y", "z", "intensity")))
         trusted = self._feed.sources.doubt(steady_ns) is None and (new or len(points) == 0)
@@ -73,7 +73,7 @@ class LidarReport:
         if covered or revolution.complete:
             self._covered = covered
         self.partial += not covered
-        # Without a return nothing would seem to be in the way.
+        # Without returns, the way would seem free.
         self.blind = len(revolution.points) < _LEAST_RETURNS * LASERS * len(revolution.firing_azimuth)
         return covered and not self.blind
 
@@ -99,7 +99,7 @@ class LidarReport:
 
         Args:
             steady_ns: steady time.
-            silence_s: time without a packet that is an error.
+            silence_s: time without a packet that counts as an error.
             source: as in `Vlp16DriverConfig`.
             where: address or file of the source.
         """
@@ -144,7 +144,7 @@ class LidarReport:
         yield Diagnosis("packets", level, text, values)
 
     def _view(self) -> Diagnosis:
-        """Return a diagnosis of the field of view, which may be why there is no scan although every packet arrives."""
+        """Return a diagnosis of the field of view, which can explain a missing scan although all packets arrive."""
         stream = self._feed.stream
         blocked = stream.head.blocked
         if blocked is None or blocked.width < 100.0 * _LEAST_BLOCKED_DEG:

@@ -42,13 +42,14 @@ class SourceGuard:
         Args:
             sender: address and port.
             is_data: True from the data port, False from the position port.
-            well_formed: False if the payload cannot be the sensor's; then it neither selects a sender nor is a fault.
+            well_formed: False if the payload cannot be the sensor's; it then neither selects a sender nor counts as a
+                fault.
             now_ns: steady time.
         """
         address, port = sender
         if well_formed:
             self._address = self._address or address
-        same = not self._address or address == self._address  # a payload of another product: the stream reports it
+        same = not self._address or address == self._address  # the stream reports payloads of another product
         before = self._ports.get(is_data, (port, now_ns))
         second_port = same and well_formed and before[0] != port and now_ns - before[1] < self.QUIET_S * 1e9
         if same and not second_port:

@@ -26,15 +26,15 @@ _OTHER_PRODUCTS = (0x21, 0x24, 0x28)
 """HDL-32E, Puck Hi-Res, VLP-32C: same packets, other elevations. Old firmware sends no product."""
 
 _MAX_GAP_US = 20_000
-"""A longer gap, without the time in a blocked sector, ends the revolution."""
+"""A longer gap ends the revolution; time in a blocked sector does not count."""
 _LATE_US = -100_000
-"""Age limit of a late packet, relative to the newest; an even older one means that the sensor's clock was reset."""
+"""Oldest late packet, relative to the newest one; an even older packet means that the sensor's clock was reset."""
 _LEAST_STEP = 0.75
 """Smallest interval to the newest packet, in periods; one sensor cannot fire two packets at once."""
 _CLOCK_SET_US = 500_000
-"""If the sensor's time gains this much on the host's over a gap, its clock was set and no packets are missing."""
+"""If the sensor's time gains this much on the host's over a gap, its clock was set; packets are not missing."""
 _MAX_PACKETS = 400
-"""More than one revolution at 300 rpm in dual mode (302); without a cut until then, the head does not turn."""
+"""More packets than a revolution at 300 rpm in dual mode (302); if none of them reaches the cut, the head stands."""
 
 
 @dataclass(frozen=True)
@@ -146,7 +146,7 @@ class PacketStream:
         return done if column is None else self._end_at_cut(column * (2 if dual else 1))
 
     def _interruption(self, step_us: int | None, sent_us: float, elapsed_us: float, dual: bool) -> Revolution | None:
-        """Count missing packets before a new one, and end the revolution where it cannot go on.
+        """Count missing packets before a new one, and end the revolution if the new packet cannot continue it.
 
         Args:
             step_us: time since the last packet on the sensor's clock; None before the first one.
@@ -180,7 +180,7 @@ class PacketStream:
         self.head.restart()
 
     def finish(self) -> Revolution | None:
-        """Return the rest as the last revolution, for example at the end of a capture."""
+        """Return the points since the last cut as the last revolution, for example at the end of a capture."""
         return self._end_early()
 
     def _end_at_cut(self, block: int) -> Revolution | None:
@@ -233,8 +233,8 @@ def _column_after_cut(azimuths: list[int], turned: int) -> int | None:
     """Return the first block (or pair of blocks) of a packet after the cut angle; None if the head does not pass it.
 
     Args:
-        azimuths: azimuth of each, 0.01 degrees.
-        turned: turn from the cut angle to the first one, 0.01 degrees.
+        azimuths: azimuth of each block or pair, 0.01 degrees.
+        turned: turn from the cut angle to the first of them, 0.01 degrees.
     """
     for column, azimuth in enumerate(azimuths):
         if column:

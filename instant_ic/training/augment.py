@@ -76,7 +76,7 @@ def without_lidar(prior: Tensor, share: float, generator: torch.Generator) -> Te
 
 
 def _on(device: torch.device, generator: torch.Generator) -> torch.Generator:
-    """Return a generator on the device, seeded by another; a CPU takes 0.2 s for the noise of 64 images."""
+    """Return a generator on the device, seeded by another, because a CPU takes 0.2 s for the noise of 64 images."""
     if device == generator.device:
         return generator
     seed = int(torch.randint(2**62, (), generator=generator))

@@ -18,7 +18,7 @@ def read_checkpoint(path: Path) -> Any:
     """Read a checkpoint to the CPU; only tensors and plain values, so that a file cannot run code.
 
     Raises:
-        CheckpointError: the file is missing, damaged, or holds more.
+        CheckpointError: the file is missing or damaged, or holds other objects.
     """
     try:
         if zipfile.is_zipfile(path):  # torch's format; torch itself does not verify the checksums

@@ -30,10 +30,10 @@ MIN_DEPTH_M, MAX_DEPTH_M = 0.1, 40.0
 _TYPICAL_M, _UNKNOWN_SIGMA = 2.5, 0.6
 """Depth in metres and relative sigma where there is no prior."""
 _LEAST_STEP, _MOST_STEP = 0.05, 0.6
-"""Bounds of the prior's sigma where it serves as the logarithmic step of the depth for an output of 1.
+"""Bounds of the prior's sigma when it scales the output: an output of 1 moves the logarithm of the depth by it.
 
-An untrained network hardly changes depth that is known to a percent, and moves unmeasured depth at once. The lower
-bound is above a percent because outliers make the mean error of such pixels 4 percent.
+An untrained network therefore hardly changes depth that is known to a percent, but moves unmeasured depth at once. The
+lower bound is above a percent because outliers make the mean error of such pixels 4 percent.
 """
 
 # Blocks of EfficientNet-lite0 to 1/16: repeats, kernel, stride, expansion, outputs. The stem is fixed in "lite".
@@ -226,7 +226,7 @@ class CompletionNet(nn.Module):
             x = self.slices(x)
         x = self.up8(functional.interpolate(x, scale_factor=2.0, mode="nearest"), down8, eighth)
         x = self.up4(functional.interpolate(x, scale_factor=2.0, mode="nearest"), down4, quarter)
-        # The prior is float32 also where the convolutions run in half precision.
+        # The prior stays float32 even if the convolutions run in half precision.
         change, spread = functional.pixel_shuffle(self.head(padded(x, 1, 1)), 4).to(prior.dtype).unbind(1)
         complete = (log_prior + sigma.clamp(_LEAST_STEP, _MOST_STEP) * change).clamp(-2.4, 3.7).exp()
         doubt = sigma * spread.clamp(-4.0, 3.0).exp()

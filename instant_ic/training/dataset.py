@@ -27,7 +27,7 @@ class Sample:
     Attributes:
         rgb: (H, W, 3) uint8.
         depth_m: (H, W) radial metres, 0 = unknown.
-        world: its seed.
+        world: seed of the world that the panorama shows.
         prior: (6, H, W) fused depth (``depth.completion.prior_channels``).
     """
 
@@ -38,7 +38,7 @@ class Sample:
 
 
 def save_sample(path: Path, rgb: NDArray[np.uint8], depth_m: Floats, priors: Sequence[Floats]) -> None:
-    """Write a panorama with its priors (``Sample``) to ``NAME.npz``; the file is there only when it is complete."""
+    """Write a panorama with its priors (``Sample``) to ``NAME.npz``; the file appears only when it is complete."""
     with replacing(path) as file:
         np.savez_compressed(file, rgb=rgb, depth_m=depth_m.astype(np.float16), priors=np.array(priors, np.float16))
 
@@ -69,7 +69,7 @@ class RenderedDataset(Sequence[Sample]):
 def open_rendered(folder: Path, size: tuple[int, int]) -> tuple[RenderedDataset, RenderedDataset]:
     """Return the panoramas of a folder for training and for evaluation.
 
-    One world in twelve is held out for evaluation; a world keeps its part when more are rendered.
+    One world in twelve is held out for evaluation. A world stays in its part when more worlds are rendered.
 
     Args:
         folder: folder that ``ic depth render`` wrote.
@@ -81,7 +81,7 @@ def open_rendered(folder: Path, size: tuple[int, int]) -> tuple[RenderedDataset,
     files: list[tuple[Path, int]] = []
     for path in sorted(folder.glob("*-*.npz")):
         shape = _shape(path)
-        if shape[0] and shape[2:] != size:  # no prior fitted to a few panoramas
+        if shape[0] and shape[2:] != size:  # a few panoramas have no prior, because none could be fitted
             raise DatasetError(f"{path}: {shape[2]} x {shape[3]}, the network takes {size[0]} x {size[1]}: render "
                                "the worlds again into another folder with its --height")  # fmt: skip
         files += [(path, number) for number in range(shape[0])]

@@ -49,8 +49,8 @@ def edge_loss(predicted: Tensor, truth: Tensor, row_weights: Tensor) -> Tensor:
 def sigma_loss(predicted: Tensor, sigma: Tensor, truth: Tensor, row_weights: Tensor) -> Tensor:
     """Return the quantile loss (Koenker and Bassett, 1978) of log sigma, smallest if 68 % of the errors are within it.
 
-    A likelihood would give the mean error instead, which a few outliers multiply: it is not comparable to the sigma of
-    the fused depth. The depth gets no gradient: otherwise it would be trained least where it is worst.
+    A likelihood would give the mean error instead, which a few outliers multiply, so it would not be comparable to the
+    sigma of the fused depth. The depth gets no gradient, because it would be trained least where it is worst.
     """
     valid = truth > 0
     safe = torch.where(valid, truth, torch.ones_like(truth)).clamp_min(MIN_DEPTH_M)

@@ -27,7 +27,7 @@ def unpack(wheel: Path, folder: Path) -> int:
     """Write the surface textures of a robosuite wheel into a folder as JPEG of at most ``SIZE``; return their number.
 
     Raises:
-        DatasetError: not such a wheel.
+        DatasetError: the file is not a wheel of robosuite, or a texture in it cannot be decoded.
     """
     folder.mkdir(parents=True, exist_ok=True)
     count = 0

@@ -25,8 +25,8 @@ if TYPE_CHECKING:
 Floats = NDArray[np.floating]
 MOST_REVOLUTIONS = 24
 MODEL_SHARE, FAULTY_SHARE, BENT_SHARE = 0.3, 0.6, 0.6
-"""Shares of priors with a local model of 2 to ``MOST_REVOLUTIONS`` revolutions instead of one, with faults of the
-revolution beyond noise, and with errors of the network as in rooms unlike those it was trained on."""
+"""Shares of priors that have a local model of 2 to ``MOST_REVOLUTIONS`` revolutions instead of one, that have faults
+beyond noise, and that have network errors as in rooms unlike the training rooms."""
 _MOST_BEND = 0.35
 _MOST_TILT_DEG, _MOST_SHIFT_M = 1.0, 0.02
 _UP = np.array([0.0, 0.0, 1.0])
@@ -36,7 +36,7 @@ def sample_prior(
     renderer: EquirectRenderer, map_from_camera: Floats, rgb: NDArray[np.uint8], depth_m: Floats,
     rng: np.random.Generator,
 ) -> NDArray[np.float32] | None:  # fmt: skip
-    """Simulate the prior (6, H, W) (``depth.completion``) of a camera in a world; None without a fit.
+    """Simulate the prior (6, H, W) (``depth.completion``) of a camera in a world; None if no depth could be fitted.
 
     Args:
         renderer: renderer of the world, whose floor is at 0.

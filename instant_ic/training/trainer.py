@@ -33,13 +33,13 @@ from instant_ic.util.files import replacing
 POLE_WEIGHT = 0.1
 """Minimum weight of a row in the loss, with a mean row weight of 1.
 
-By solid angle alone the rows at the poles would hardly be trained, and would be spikes above and below the camera.
+Weighted by solid angle alone, the rows at the poles would hardly be trained and would show as spikes.
 """
 HEAD_RATE = 0.1
-"""Learning rate of the last layer over that of the decoder.
+"""Learning rate of the last layer relative to that of the decoder.
 
-Adam moves each of the 400 weights behind an output by the rate in a step. At the decoder's rate they would together
-leave the prior in a few steps, before they have learnt anything.
+In each step, Adam moves each of the 400 weights behind an output by the rate. At the decoder's rate, the output would
+leave the prior within a few steps, before the weights have learnt anything.
 """
 
 
@@ -51,23 +51,23 @@ class TrainingConfig:
         minutes: wall time of the learning rate schedule, after which training ends.
         epochs: passes over the data after which training ends, if that comes first.
         batch_size: panoramas per step.
-        learning_rate: maximum, of AdamW.
-        encoder_rate: learning rate of the pretrained encoder over that of the decoder; 0: the encoder is fixed, and a
-            step costs half.
-        weight_decay: of AdamW.
+        learning_rate: maximum learning rate of AdamW.
+        encoder_rate: learning rate of the pretrained encoder relative to that of the decoder; 0 fixes the encoder,
+            which halves the cost of a step.
+        weight_decay: weight decay of AdamW.
         warmup: share of the schedule in which the learning rate rises.
         average: decay of the weight average per step.
         edge_share: weight of the edge loss.
         sigma_share: weight of the loss of the uncertainty.
         photograph: augment images with the effects of a real camera.
-        no_lidar: share of the panoramas whose prior is the network's depth alone, as where no LiDAR measures.
+        no_lidar: share of the panoramas whose prior is the network's depth alone, as without a LiDAR.
         brightness: mean byte to which each image is scaled before the network, as in inference; 0: unchanged.
         evaluation_panoramas: number of held-out panoramas evaluated during training.
         checkpoint_s: seconds between checkpoints with evaluation.
         max_range_m: ground truth beyond it is unknown; output beyond it is clipped.
         mixed_precision: convolutions in bfloat16, or in float16 on a GPU without bfloat16.
-        threads: CPU threads. On cores that are also used by others more threads wait for each other.
-        seed: of weights, order and augmentation.
+        threads: CPU threads. On cores that other programs also use, more threads only wait for each other.
+        seed: seed of weights, order and augmentation.
     """
 
     minutes: float = 60.0
@@ -176,7 +176,7 @@ class Trainer:
     Attributes:
         feed: training batches, of ``config.batch_size``.
         held_out: panoramas for evaluation, from worlds that are not in the feed.
-        model: network to train; it keeps the weights it has.
+        model: network to train, starting from its present weights.
         output: checkpoint file.
         data: source of the panoramas, for the record.
         origin: source of the first weights, for the record.
@@ -279,7 +279,7 @@ class Trainer:
         begin = time.monotonic() - self.elapsed_s
         last_checkpoint, last_report, losses = time.monotonic(), (time.monotonic(), self.step), []
         if not self.history:
-            self._checkpoint(self._evaluate(self._picked()), [])  # the prior
+            self._checkpoint(self._evaluate(self._picked()), [])  # figures of the prior itself, before any training
         while self.progress < 1.0 and not self.stop:
             losses.append(self.train_step())
             self.elapsed_s = time.monotonic() - begin

@@ -224,7 +224,7 @@ def test_fault_every_local_user_sees_a_real_robot(world):
             world.client(path="/" + query)
         assert refused.value.response.status_code == 401
     assert world.client(path=f"/?token={token}").info["name"] == "Instant IC"
-    wait_for(lambda: "no token" in world.live.told("door"), "the diagnosis")
+    wait_for(lambda: "token is missing" in world.live.told("door"), "the diagnosis")
     assert token not in str(bridge.diagnoses())
     world.close()
     assert not file.exists()

@@ -165,7 +165,7 @@ def test_a_bare_room_gives_no_calibration():
         calibrate([], np.eye(4), **QUICK)
     # Edges enough, but the picture shows nothing of them: lens cap on.
     jagged = scan(lambda azimuth, elevation: np.where(np.sin(20 * azimuth) > 0, 2.0, 4.0))
-    with pytest.raises(CalibrationError, match="nowhere better than by chance"):
+    with pytest.raises(CalibrationError, match="better than chance"):
         calibrate([CalibrationFrame(bare.rgb, *jagged)], np.eye(4), **QUICK)
 
 
