@@ -1,4 +1,4 @@
-"""Builds worlds from zones: rectangles of free space become floors, ceilings, walls, doorways and their fittings."""
+"""Worlds built from zones: rectangles of free space get floors, ceilings, walls, doorways and fittings."""
 
 import math
 from dataclasses import dataclass, field, replace
@@ -27,7 +27,7 @@ class Finish:
 
 @dataclass(frozen=True)
 class Zone:
-    """Rectangle of free space from the floor to ``height``; zones that touch have an opening between them."""
+    """A rectangle of free space from the floor to ``height``. Zones that touch have an opening between them."""
 
     x0: float
     y0: float
@@ -42,7 +42,7 @@ class Zone:
         return 0.5 * (self.x0 + self.x1), 0.5 * (self.y0 + self.y1)
 
     def side(self, name: str) -> tuple[Point, Point]:
-        """Return the ends of a wall, left to right from inside; ``north`` is the wall at y1, ``east`` at x1."""
+        """Return the ends of a wall, left to right as seen from inside; ``north`` is the wall at y1, ``east`` at x1."""
         return {
             "north": ((self.x0, self.y1), (self.x1, self.y1)),
             "south": ((self.x1, self.y0), (self.x0, self.y0)),
@@ -124,11 +124,11 @@ class Building:
         front: Material,
         edge: Material | None = None,
     ) -> None:
-        """Add a board that protrudes by ``depth`` from the wall start → end, between two lengths and two heights."""
+        """Add a board that protrudes by ``depth`` from the wall start → end, at the given lengths and heights."""
         edge = edge or front
         a, b = np.asarray(start, float), np.asarray(end, float)
         right = (b - a) / np.linalg.norm(b - a)
-        # Inward points towards the viewer who sees the start of the wall on the left.
+        # Inward is towards the viewer who sees the start of the wall on the left.
         inward = np.asarray([right[1], -right[0]])
         low, high = heights
         p, q = a + right * along[0], a + right * along[1]
@@ -156,7 +156,7 @@ class Building:
         self.relief(start, end, (at - size[0] / 2, at + size[0] / 2), heights, 0.012, replace(material, size_m=0), edge)
 
     def window(self, zone: Zone, side: str, at: float, width: float, variant: int, shine: float = 1.6) -> None:
-        """Add a window with frame and sill; the outside is a luminous image."""
+        """Add a window with frame and sill, and a luminous image as the view outside."""
         start, end = zone.side(side)
         frame = Material("white", 1.0, (0.95, 0.95, 0.95))
         low, high = 0.9, min(zone.height - 0.3, 2.2)
@@ -194,7 +194,7 @@ class Building:
                 self.builder.panel((x - lx / 2, y - ly / 2, low - 0.002), (lx, 0, 0), (0, ly, 0), lamp)
 
     def open_leaf(self, door: Zone, towards: str, hinge_high: bool, angle_deg: float, variant: int) -> None:
-        """Add a door leaf that is open into the zone on one side (``north``...) of the doorway."""
+        """Add an open door leaf in the zone on the side ``towards`` (``north``...) of the doorway."""
         width = (door.x1 - door.x0) if towards in ("north", "south") else (door.y1 - door.y0)
         if towards in ("north", "south"):
             hinge = np.asarray([door.x1 if hinge_high else door.x0, door.y1 if towards == "north" else door.y0])

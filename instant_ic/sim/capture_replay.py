@@ -1,4 +1,4 @@
-"""Replays the UDP payloads of a recording at their recorded pace."""
+"""Replay of the UDP payloads of a recording at their recorded pace."""
 
 import contextlib
 import socket
@@ -11,7 +11,7 @@ from instant_ic.lidar.packets import DATA_PACKET_BYTES, POSITION_PACKET_BYTES
 
 
 def with_noise(packet: bytes, rng: np.random.Generator) -> bytes:
-    """Return a data packet of which a random half of the returns is 2 mm nearer or farther."""
+    """Return a data packet with a random half of its returns moved 2 mm nearer or farther."""
     data = np.frombuffer(packet, np.uint8).copy()
     returns = data[:1200].reshape(12, 100)[:, 4:].reshape(12, 32, 3)
     returns[..., 0] ^= rng.integers(0, 2, (12, 32), np.uint8) & (returns[..., :2].max(axis=2) > 1)
@@ -19,18 +19,18 @@ def with_noise(packet: bytes, rng: np.random.Generator) -> bytes:
 
 
 class CaptureReplay:
-    """Sends the data and position packets of a VLP-16 capture with recorded timing, at first with unchanged payloads.
+    """A sender of the data and position packets of a VLP-16 capture, with their recorded timing.
 
-    It starts again after the end, with a pause of one packet. The ranges then have noise: without it, a short capture
-    would be a sensor that repeats itself, which the driver withholds.
+    The capture is repeated after a pause of one packet. From the second pass on, the ranges have noise, because the
+    driver withholds data of a sensor that repeats itself.
 
     Args:
-        path: pcap or pcapng.
+        path: pcap or pcapng file.
         host: destination address.
         data_port, position_port: destination UDP ports; the recorded ports are ignored.
 
     Attributes:
-        sent: datagrams sent.
+        sent: number of datagrams sent.
         duration_s: length of the recording.
 
     Raises:
@@ -44,7 +44,7 @@ class CaptureReplay:
         if not datagrams:
             raise ValueError(f"pcap {path} has no VLP-16 packets (UDP payloads of 1206 or 512 bytes)")
         first = min(d.stamp_ns for d in datagrams)
-        # The sort is stable: packets with equal stamps keep their order, or the driver would count them as late.
+        # The sort must be stable: the driver would count packets with equal stamps in another order as late.
         self._items = sorted(
             (((d.stamp_ns - first) * 1e-9, (host, ports[len(d.payload)]), d.payload) for d in datagrams),
             key=lambda item: item[0],
@@ -65,7 +65,7 @@ class CaptureReplay:
             _, address, payload = self._items[self._next]
             if self._rng is not None and len(payload) == DATA_PACKET_BYTES:
                 payload = with_noise(payload, self._rng)
-            # The kernel reports the refusal of an earlier datagram here; a real sensor ignores it.
+            # The kernel reports the refusal of an earlier datagram here. A real sensor ignores it.
             with contextlib.suppress(ConnectionRefusedError):
                 self._socket.sendto(payload, address)
             self.sent += 1

@@ -1,4 +1,4 @@
-"""Occupancy of the floor plan by a mesh, for contact tests."""
+"""Floor plan of the space that a mesh occupies, for contact tests."""
 
 from dataclasses import dataclass
 
@@ -11,7 +11,7 @@ FloatArray = npt.NDArray[np.floating]
 
 @dataclass(frozen=True)
 class OccupancyMask:
-    """Floor plan of the objects in a height interval.
+    """A floor plan of the objects in a height interval.
 
     Attributes:
         cells: (H, W) bool, row 0 = lowest y.
@@ -32,7 +32,7 @@ class OccupancyMask:
         return np.floor((np.asarray(xy) - self.origin) / self.cell_m).astype(np.int64)[:, ::-1]
 
     def at(self, xy: FloatArray) -> npt.NDArray[np.bool_]:
-        """Return which points (N, 2) lie in occupied cells; everything outside the mask is free."""
+        """Return the mask (N,) of the points (N, 2) in occupied cells; space outside the floor plan is free."""
         index = self.index(xy)
         inside = ((index >= 0) & (index < self.cells.shape)).all(axis=1)
         result = np.zeros(len(index), bool)
@@ -47,7 +47,7 @@ class OccupancyMask:
         return np.asarray(cv2.distanceTransform(free, cv2.DIST_L2, 5) * self.cell_m, np.float32)
 
     def reachable(self, start_xy: tuple[float, float], clearance_m: float) -> npt.NDArray[np.int64]:
-        """Return the cells (N, 2) with this clearance that connect to the one nearest to ``start_xy``."""
+        """Return the cells (N, 2) with this clearance that are connected to the one nearest to ``start_xy``."""
         import cv2
 
         free = self.distance_m() >= clearance_m

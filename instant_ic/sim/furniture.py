@@ -28,7 +28,7 @@ def table(
 
 
 def chair(build: WorldBuilder, centre: Point, yaw: float, seat: Material | None = None) -> None:
-    """Add a chair that faces its own +x: seat, back, four legs."""
+    """Add a chair that faces along its own x axis: seat, back, four legs."""
     seat = seat or Material("fabric", 0.5, (0.4, 0.5, 0.8))
     leg = Material("metal", 0.5, (0.5, 0.5, 0.5))
     build.box(centre, (0.44, 0.44, 0.06), 0.42, yaw, side=seat)
@@ -40,13 +40,13 @@ def chair(build: WorldBuilder, centre: Point, yaw: float, seat: Material | None 
 
 
 def bookcase(build: WorldBuilder, centre: Point, yaw: float, variant: int, height: float = 2.0) -> None:
-    """Add a bookcase whose books face its own +x."""
+    """Add a bookcase whose books face along its own x axis."""
     wood = Material("wood", 0.8, (0.7, 0.7, 0.7))
     build.box(centre, (0.32, 1.0, height), 0.0, yaw, side=wood, front=Material(f"books:{variant}", 0))
 
 
 def cabinet(build: WorldBuilder, centre: Point, yaw: float, size: tuple[float, float, float], body: Material) -> None:
-    """Add a cupboard with two doors and handles at its own +x."""
+    """Add a cupboard with two doors and handles, which face along its own x axis."""
     build.box(centre, size, 0.0, yaw, side=body)
     handle = Material("metal", 0.3, (0.4, 0.4, 0.4))
     gap = Material("white", 0.5, (0.15, 0.15, 0.15))
@@ -58,7 +58,7 @@ def cabinet(build: WorldBuilder, centre: Point, yaw: float, size: tuple[float, f
 
 
 def sofa(build: WorldBuilder, centre: Point, yaw: float, cloth: Material, width: float = 1.8) -> None:
-    """Add a sofa that faces its own +x."""
+    """Add a sofa that faces along its own x axis."""
     build.box(centre, (0.85, width, 0.42), 0.0, yaw, side=cloth)
     build.box(_turned(centre, yaw, (-0.33, 0.0)), (0.2, width, 0.4), 0.42, yaw, side=cloth)
     for side in (-1, 1):

@@ -19,7 +19,7 @@ from instant_ic.util.files import replacing
 Arrays = dict[str, npt.NDArray[np.generic]]
 
 MOST_BYTES = 256 << 20
-"""Size limit of the cache; beyond it the least recently used files are deleted."""
+"""Size limit of the cache. Above it, the least recently used files are deleted."""
 
 
 def kept(kind: str, parts: Iterable[str | npt.NDArray[np.generic]], make: Callable[[], Arrays]) -> Arrays:
@@ -27,11 +27,11 @@ def kept(kind: str, parts: Iterable[str | npt.NDArray[np.generic]], make: Callab
 
     Args:
         kind: kind of the arrays; part of the file name.
-        parts: everything that the arrays depend on; the code of this package is added.
-        make: computes the arrays.
+        parts: all inputs on which the arrays depend; a hash of this package's code is added.
+        make: function that computes the arrays.
 
     Returns:
-        Arrays by name, bit-identical to those of ``make``. An unusable folder or a damaged file costs only time.
+        Arrays by name, bit-identical to those of ``make``; computed again if a folder or file is unusable.
     """
     digest = hashlib.sha256(_code())
     for part in parts:
@@ -66,7 +66,7 @@ def _code() -> bytes:
 def _make_room(folder: Path) -> None:
     files = []
     for file in folder.iterdir():
-        with suppress(FileNotFoundError):  # another process also deletes files
+        with suppress(FileNotFoundError):  # another process may have deleted the file
             status = file.stat()
             files.append((status.st_mtime, status.st_size, file))
     total = sum(size for _, size, _ in files)

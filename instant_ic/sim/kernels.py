@@ -1,4 +1,4 @@
-"""Compiled loops of the renderer: visibility, filtered texture lookup, shading. All release the GIL."""
+"""Compiled loops of the renderer: visibility, filtered texture lookup and shading. All of them release the GIL."""
 
 from typing import Any, NamedTuple
 
@@ -11,30 +11,30 @@ I32 = npt.NDArray[np.int32]
 I64 = npt.NDArray[np.int64]
 U8 = npt.NDArray[np.uint8]
 U32 = npt.NDArray[np.uint32]
-#: float32 in compiled code; numpy's stubs have several types for it.
+#: float32 in compiled code, for which numpy's stubs have several types.
 Scalar = Any
 
 #: Entries of the tone table, which maps the square root of radiance, 0..TONE_ROOT, to sRGB.
 TONE_SIZE = 4096
 TONE_ROOT = 2.0
 _ROOT = np.float32((TONE_SIZE - 1) / TONE_ROOT)
-#: Tone index of radiance 1.5, where samples of edge pixels are clipped like in a sensor: lamps keep smooth borders.
+#: Tone index of radiance 1.5. Samples of edge pixels are clipped there, as by a sensor, so that lamps look smooth.
 _WHITE = np.float32(_ROOT * np.sqrt(1.5))
 #: A bilinear lookup gives albedo as a square root in units of 1 / (255 · 256).
 _PER_LOOKUP = np.float32(_ROOT / (255 * 256))
-#: Pixels between two light lookups; light is interpolated in between.
+#: Number of pixels from one light lookup to the next; the light in between is interpolated.
 _LIGHT_STEP = 4
-#: Rays that are shaded together.
+#: Number of rays that are shaded together.
 _SPAN = 256
-#: Most surfaces that an edge pixel is sampled from.
+#: Largest number of surfaces among which an edge pixel is sampled.
 _MOST = 32
-#: A surface's border is widened by this, so that no ray slips through between two surfaces, metres.
+#: Distance in metres by which a surface's border is widened, so that no ray slips through between two surfaces.
 _GAP_M = np.float32(1e-4)
 
 UNKNOWN = -2
 SKY = -1
 
-#: Samples of an edge pixel (rows, columns, pixels from its centre), one per row and column of eighths.
+#: Number of samples of an edge pixel: one in each eighth of its rows and of its columns.
 _SAMPLES = 8
 _SAMPLE_ROWS = (np.arange(_SAMPLES, dtype=np.float32) + np.float32(0.5)) / 8 - np.float32(0.5)
 _SAMPLE_COLUMNS = (np.arange(0, 3 * _SAMPLES, 3, dtype=np.float32) % 8 + np.float32(0.5)) / 8 - np.float32(0.5)
@@ -46,7 +46,7 @@ class Projection(NamedTuple):
     Attributes:
         across, down, scale: tables of the lens, see ``render._Lens``.
         strides: (H,) columns per shaded pixel.
-        wraps: True for a panorama.
+        wraps: True for a panorama, whose last column adjoins the first.
     """
 
     across: F32
@@ -57,12 +57,12 @@ class Projection(NamedTuple):
 
 
 class Scene(NamedTuple):
-    """Surfaces with textures and light.
+    """The surfaces of a world with textures and light.
 
     Attributes:
         forms: (S, 9, 4) affine functions of a point relative to the camera, see ``World.forms``.
         looks: (S, 5) texels per metre; root of the tint, in tone indices per lookup; root of the emission.
-        owns: (S, 6) texture, its last level, whether it is clamped, first texel of the light map, its width and height.
+        owns: (S, 6) texture, its last level, 1 if it is clamped, first texel of the light map, its width and height.
         levels: (T, L, 3) first texel, width and height of each level of each texture.
         texels: texels of all textures.
         light: (L, 3) square root of light times tint, in tone indices per lookup.
@@ -80,10 +80,10 @@ _FLAGS = {
     "cache": True, "nogil": True, "error_model": "numpy", "fastmath": {"contract", "arcp", "nsz", "reassoc"},
 }  # fmt: skip
 _jit = numba.njit(**_FLAGS)
-#: Without reference counts of arrays, which cost more than the lookups; such a function cannot make arrays.
+#: Compiler without reference counts of arrays, which cost more than the lookups; the functions cannot make arrays.
 _bare = numba.njit(_nrt=False, **_FLAGS)
 
-#: For functions with one caller, which are separate only to be read.
+#: Compiler for functions with one caller, which are separate functions only for readability.
 _inlined = numba.njit(_nrt=False, inline="always", **_FLAGS)
 
 
@@ -95,7 +95,9 @@ def _along(forms: F32, s: int, k: int, d: tuple[Scalar, Scalar, Scalar]) -> Scal
 
 @_bare
 def _border(forms: F32, s: int, k: int, q: Any, ray: Any, by_row: Any, by_column: Any) -> tuple[Scalar, Scalar, Scalar]:
-    """Return the position from border ``k`` over the range: at the pixel's centre, per row and per column."""
+    """Return the distance from border ``k`` divided by the range, at the pixel's centre, and its change per row and
+    column.
+    """
     w = forms[s, k, 3] + _GAP_M
     return (
         w * q[0] + _along(forms, s, k, ray),
@@ -119,10 +121,10 @@ def _hit(forms: F32, s: int, dx: Scalar, dy: Scalar, dz: Scalar) -> Scalar:
 
 @_bare
 def fill_cells(surface: I32, step: int, wraps: bool) -> None:
-    """Fill in the UNKNOWN pixels of the cells between every ``step``-th row and column that one surface covers.
+    """Fill in the UNKNOWN pixels of cells that one surface covers. Cells lie between every ``step``-th row and column.
 
-    It does if it covers the four corners, because surfaces are planar and convex. The last row, and without ``wraps``
-    the last column, also end cells.
+    A surface covers a cell if it covers the four corners, because surfaces are planar and convex. Cells also end at the
+    last row and, without ``wraps``, at the last column.
     """
     height, width = surface.shape
     for top in range(0, height - 1, step):
@@ -142,7 +144,7 @@ def fill_cells(surface: I32, step: int, wraps: bool) -> None:
 
 @_bare
 def fill_guessed(surface: I32, across: F32, down: F32, scale: F32, forms: F32) -> None:
-    """Fill in the UNKNOWN pixels with the nearest of the surfaces at their four neighbours that their ray hits."""
+    """Fill in each UNKNOWN pixel with the nearest surface that its ray hits among those of its four neighbours."""
     height, width = surface.shape
     for row in range(1, height - 1, 2):
         for column in range(1, width - 1, 2):
@@ -165,10 +167,10 @@ def fill_guessed(surface: I32, across: F32, down: F32, scale: F32, forms: F32) -
 def unknown(surface: I32, step: int, whole: bool, out: I64) -> int:
     """List the UNKNOWN pixels (flat indices) in every ``step``-th row and column, and in the last ones.
 
-    Without ``whole`` those are left out that lie in odd rows and columns and not at the image's border.
+    Without ``whole``, pixels in both an odd row and an odd column are left out, except at the image's border.
 
     Returns:
-        Their number.
+        Number of listed pixels.
     """
     height, width = surface.shape
     count = 0
@@ -185,7 +187,7 @@ def unknown(surface: I32, step: int, whole: bool, out: I64) -> int:
 
 @_bare
 def rays(pixels: I64, width: int, across: F32, down: F32, scale: F32, out: F32) -> None:
-    """Enter the unit directions (N, 3) of pixels (N,), flat indices."""
+    """Write the unit directions (N, 3) of pixels (N,), flat indices, to ``out``."""
     for i in range(pixels.shape[0]):
         row, column = pixels[i] // width + 1, pixels[i] % width + 1
         x = scale[row] * across[0, column] + down[0, row]
@@ -197,7 +199,7 @@ def rays(pixels: I64, width: int, across: F32, down: F32, scale: F32, out: F32) 
 
 @_bare
 def place(surface: I32, pixels: I64, face: I32, face_surface: I32) -> None:
-    """Enter the surfaces of the faces (N,) that the rays of pixels (N,), flat indices, hit."""
+    """Write the surface of the face (N,) that each ray hit to its pixel (N,), a flat index of ``surface``."""
     flat = surface.reshape(-1)
     for i in range(pixels.shape[0]):
         flat[pixels[i]] = face_surface[face[i]] if face[i] >= 0 else SKY
@@ -205,7 +207,7 @@ def place(surface: I32, pixels: I64, face: I32, face_surface: I32) -> None:
 
 @_bare
 def ranges(surface: I32, across: F32, down: F32, scale: F32, forms: F32, out: F32) -> None:
-    """Enter the radial distance (H, W) of every pixel's surface, 0 for the sky."""
+    """Write the radial distance (H, W) of every pixel's surface to ``out``; 0 for the sky."""
     height, width = surface.shape
     for row in range(height):
         c, bx, by, bz = scale[row + 1], down[0, row + 1], down[1, row + 1], down[2, row + 1]
@@ -255,7 +257,7 @@ def _light_texel(
 
 @_bare
 def _light(s: int, x: Scalar, y: Scalar, z: Scalar, scene: Scene) -> tuple[Scalar, Scalar, Scalar]:
-    """Return the tone index per lookup unit (square root of light · tint) at (x, y, z) from the camera."""
+    """Return the square root of light · tint, in tone indices per lookup unit, at (x, y, z) from the camera."""
     forms, looks, owns = scene.forms, scene.looks, scene.owns
     e = looks[s, 4]
     if e == 0:
@@ -269,8 +271,10 @@ def _light(s: int, x: Scalar, y: Scalar, z: Scalar, scene: Scene) -> tuple[Scala
 
 @_bare
 def _lookup(texels: U32, first: int, width: int, height: int, u: Scalar, v: Scalar) -> Any:
-    """Look up a texture bilinearly at 0..1: three lanes of 16 bits (red, blue, green), see ``_PER_LOOKUP``."""
-    # Sixteenths of a texel: the weights of the four texels sum to 256.
+    """Look up a texture bilinearly at (u, v), 0..1. Returns three lanes of 16 bits (red, blue, green), see
+    ``_PER_LOOKUP``.
+    """
+    # Positions are in sixteenths of a texel, so that the weights of the four texels sum to 256.
     x = np.int64(u * np.float32(16 * width) + np.float32(8.5))
     y = np.int64(v * np.float32(16 * height) + np.float32(8.5))
     at = np.uint64(first + (y >> 4) * (width + 2) + (x >> 4))
@@ -295,7 +299,7 @@ def _lookup(texels: U32, first: int, width: int, height: int, u: Scalar, v: Scal
 
 @_bare
 def _texel(texture: tuple[Any, Any, bool], fine: Scalar, u: Scalar, v: Scalar, levels: I64, texels: U32) -> Any:
-    """Look up a texture (number, last level, clamped) at the level of texels of size sqrt(``fine``)."""
+    """Look up a texture (number, last level, clamped) at the level whose texels have the size sqrt(``fine``)."""
     one = np.float32(1)
     number, last, clamped = texture
     level = np.uint64(min(max(np.int64(np.float32(fine).view(np.int32) >> 23) - 127, 0), last))
@@ -320,13 +324,13 @@ def _albedo(
 
 @_bare
 def _texture(scene: Scene, s: int) -> tuple[Any, Any, bool]:
-    """Return the texture of surface ``s``: number, last level, whether it is clamped."""
+    """Return the texture of surface ``s``: number, last level, and whether it is clamped."""
     return np.uint64(scene.owns[s, 0]), scene.owns[s, 1], scene.owns[s, 2] != 0
 
 
 @_bare
 def _plane(s: int, f: F32) -> Any:
-    """Return the coefficients of surface ``s``: normal and distance, texture coordinates u and v."""
+    """Return the coefficients of surface ``s``: those of its plane, and of its texture coordinates u and v."""
     return (
         f[s, 0, 0], f[s, 0, 1], f[s, 0, 2], -f[s, 0, 3],
         f[s, 1, 0], f[s, 1, 1], f[s, 1, 2], f[s, 1, 3],
@@ -336,10 +340,10 @@ def _plane(s: int, f: F32) -> Any:
 
 @_bare
 def _meet(plane: Any, size: Scalar, footprint: Scalar, x: Scalar, y: Scalar, z: Scalar) -> Any:
-    """Intersect a ray with a plane: range, texture coordinates, half the footprint's long axis, squared texel size.
+    """Intersect a ray with a plane. ``size`` is the ray's footprint in texels at 1 m.
 
-    The long axis is 0 at steep view angles, where one lookup covers the footprint. ``size`` is the footprint in texels
-    at 1 m.
+    Returns the range, the texture coordinates, half the footprint's long axis (0 at steep view angles, where one lookup
+    covers the footprint), and the squared size of a texel.
     """
     one = np.float32(1)
     nx, ny, nz, over, ux, uy, uz, uw, vx, vy, vz, vw = plane
@@ -352,7 +356,7 @@ def _meet(plane: Any, size: Scalar, footprint: Scalar, x: Scalar, y: Scalar, z: 
     stretch = one / side
     oblique = stretch > np.float32(2.0)
     across = t * size
-    # The square of the size, rounded to the nearest half octave by its exponent.
+    # This is the square of the texel size; its exponent rounds the size to the nearest half octave.
     fine = np.float32(1.4142135) * across * across * (np.float32(0.25) * stretch * stretch if oblique else stretch)
     flat = one - side * side
     flat = flat if flat > np.float32(0.1) else np.float32(0.1)
@@ -363,7 +367,7 @@ def _meet(plane: Any, size: Scalar, footprint: Scalar, x: Scalar, y: Scalar, z: 
 
 @_bare
 def _sky(z: Scalar) -> tuple[Scalar, Scalar, Scalar]:
-    """Return the tone indices of the open sky, for worlds that are not closed."""
+    """Return the tone indices of the sky, which worlds without a closed roof show."""
     up = max(z, np.float32(0.0))
     return (
         _ROOT * np.sqrt(np.float32(0.62) - np.float32(0.30) * up),
@@ -374,9 +378,9 @@ def _sky(z: Scalar) -> tuple[Scalar, Scalar, Scalar]:
 
 @_bare
 def _shade(s: int, first: int, end: int, ray: F32, footprint: Scalar, scene: Scene, work: F32, out: F32) -> None:
-    """Enter tone indices of rays ``first`` to ``end`` of ``ray`` (3, N), which hit surface ``s``, into ``out`` (3, N).
+    """Write the tone indices of rays ``first`` to ``end`` of ``ray`` (3, N), all on surface ``s``, to ``out`` (3, N).
 
-    The texture is averaged over the angle ``footprint``; ``work`` holds six values for each of ``_SPAN`` rays.
+    The texture is averaged over the angle ``footprint``. ``work`` is a buffer of six values for each of ``_SPAN`` rays.
     """
     if s < 0:
         for i in range(first, end):
@@ -417,7 +421,7 @@ def _shade(s: int, first: int, end: int, ray: F32, footprint: Scalar, scene: Sce
 
 @_bare
 def _point(s: int, footprint: Scalar, x: Scalar, y: Scalar, z: Scalar, scene: Scene) -> tuple[Scalar, Scalar, Scalar]:
-    """Return the tone indices of one ray, which hits surface ``s``."""
+    """Return the tone indices of one ray that hits surface ``s``."""
     if s < 0:
         return _sky(z)
     t, u, v, du, dv, fine = _meet(_plane(s, scene.forms), footprint * scene.looks[s, 0], footprint, x, y, z)
@@ -430,7 +434,7 @@ def _point(s: int, footprint: Scalar, x: Scalar, y: Scalar, z: Scalar, scene: Sc
 def _is_edge(s: int, o: int, dx: Scalar, dy: Scalar, dz: Scalar, forms: F32, owns: I64) -> bool:
     """Return whether surfaces ``s`` and ``o`` of two neighbouring pixels look different.
 
-    Adjoining surfaces of the same texture (one wall in two pieces, the triangles of a smooth mesh) do not.
+    Adjoining surfaces of the same texture (one wall in two pieces, the triangles of a smooth mesh) look alike.
     """
     if s < 0 or o < 0 or owns[s, 0] != owns[o, 0]:
         return True
@@ -447,10 +451,10 @@ def _is_edge(s: int, o: int, dx: Scalar, dy: Scalar, dz: Scalar, forms: F32, own
 def _around(
     surface: I32, row: int, first: int, projection: Projection, forms: F32, owns: I64, near: I32
 ) -> tuple[int, bool]:
-    """Enter the surfaces in and around pixel (``row``, ``first`` strides) into ``near``, itself first.
+    """Write the surfaces in and around pixel (``row``, ``first`` strides) to ``near``, the pixel's own surface first.
 
     Returns:
-        Their number, and whether the pixel lies on an edge.
+        Number of surfaces, and whether the pixel lies on an edge.
     """
     across, down, scale, strides, wraps = projection
     height, width = surface.shape
@@ -487,9 +491,9 @@ def _around(
 
 @_bare
 def _add_adjoining(forms: F32, adjoining: I32, near: I32, known: int) -> int:
-    """Add to ``known`` surfaces in ``near`` those that adjoin them and face the camera; return the new number.
+    """Add the surfaces that adjoin the ``known`` ones in ``near`` and face the camera; return the new number.
 
-    The sides of a thin board are narrower than a pixel, so that no pixel around may show them.
+    They are needed because the sides of a thin board are narrower than a pixel: maybe no pixel around shows them.
     """
     before = known
     for m in range(before):
@@ -531,9 +535,9 @@ def _sample(row: int, first: int, dr: Scalar, dc: Scalar, projection: Projection
 def _cover(
     row: int, first: int, projection: Projection, forms: F32, near: I32, known: int, inverse: F32, shown: I32
 ) -> None:
-    """Enter the index in ``near`` of the nearest surface at each sample of a pixel into ``shown``.
+    """Write the nearest surface at each sample of a pixel, as its index in ``near``, to ``shown``.
 
-    Over a pixel, the inverse of the range and the position relative to each border, divided by the range, are affine.
+    Over a pixel, the inverse of the range is affine, and so is the distance from each border divided by the range.
     """
     across, down, scale, strides, _ = projection
     stride, half = strides[row], np.float32(0.5)
@@ -618,8 +622,8 @@ def compose(
 ) -> None:  # fmt: skip
     """Shade the image (H, W, 3), sRGB, with anti-aliased edges.
 
-    In a row with a stride only every stride-th pixel is shaded; the pixels in between are interpolated. A sample of an
-    edge pixel shows the nearest of the surfaces that the pixels around it show and of those that adjoin them
+    In a row with a stride, only every stride-th pixel is shaded and the pixels in between are interpolated. A sample of
+    an edge pixel shows the nearest among the surfaces of the pixels around it and those that adjoin these
     (``adjoining``, (S, 4)).
     """
     width = surface.shape[1]
@@ -643,7 +647,7 @@ def compose(
 
 @_inlined
 def _read_row(surface: I32, row: int, projection: Projection, work: Work) -> None:
-    """Enter the directions and surfaces of a row's shaded pixels, and mark those with a different neighbour."""
+    """Write directions and surfaces of a row's shaded pixels to ``work``; mark pixels with a different neighbour."""
     across, down, scale, strides, wraps = projection
     ray, line, differs = work.ray, work.line, work.differs
     height, width = surface.shape
@@ -686,7 +690,7 @@ def _shade_row(
     surface: I32, row: int, projection: Projection, adjoining: I32, edge_footprint: Scalar, footprint: Scalar,
     scene: Scene, work: Work,
 ) -> None:  # fmt: skip
-    """Shade a row: runs of one surface at once, edge pixels by their samples."""
+    """Shade a row: each run of one surface at once, and edge pixels by their samples."""
     line, differs, near = work.line, work.differs, work.near
     forms, owns = scene.forms, scene.owns
     stride = projection.strides[row]
@@ -714,7 +718,7 @@ def _shade_row(
 def _shade_edge(
     row: int, first: int, projection: Projection, known: int, footprint: Scalar, scene: Scene, work: Work
 ) -> None:
-    """Shade an edge pixel: the mean of its surfaces, weighted by their samples and taken at the samples' centre."""
+    """Shade an edge pixel: the mean of its surfaces' colours at their samples' centres, weighted by their samples."""
     near, weight, shift, shown, root = work.near, work.weight, work.shift, work.shown, work.root
     one = np.float32(1)
     for m in range(known):
@@ -762,7 +766,7 @@ def light_at_hits(
     surface: I32, range_m: F32, origins: F32, directions: F32, light_at: I64, light_uv: F32, light: F32, albedo: F32,
     out: F32,
 ) -> None:  # fmt: skip
-    """Enter the light (N, 3) that surfaces reflect where rays hit; zero where the range is negative.
+    """Write the light (N, 3) that surfaces reflect where rays hit to ``out``; zero where the range is negative.
 
     The irradiance is bilinear in each surface's light map.
     """

@@ -14,13 +14,13 @@ F32 = npt.NDArray[np.float32]
 
 #: Largest size of an emitter piece; emitters are split for soft shadows.
 _PIECE_M = 0.7
-#: Ambient light, which stands for further bounces, as a share of the light on a lamp-lit wall.
+#: Ambient light in place of further bounces, as a share of the light on a lamp-lit wall.
 _AMBIENT = 0.34
-#: Median light of vertical surfaces after baking (the exposure).
+#: Median light of vertical surfaces after baking, which sets the exposure.
 _LEVEL = 0.72
-#: Rays per corner of a mesh file's triangle.
+#: Number of rays per corner of a mesh file's triangle.
 _MESH_RAYS = 24
-#: Largest distance of an occluder.
+#: Largest distance at which an object darkens the ambient light.
 _AMBIENT_REACH_M = 1.6
 
 
@@ -83,7 +83,7 @@ def _pairs(
             cos_e = -(emitter_normal[e, 0] * dx + emitter_normal[e, 1] * dy + emitter_normal[e, 2] * dz)
             if cos_i <= 0.0 or cos_e <= 0.0:
                 continue
-            # Softened near the emitter, because it is not a point.
+            # The light is softened near the emitter, which is not a point.
             factor = cos_i * cos_e / (math.pi * square * (square + 0.15))
             if factor * power[e, 0] < least:
                 continue
@@ -134,7 +134,7 @@ def _direct(world: World, points: F32, normals: F32) -> F32:
 
 
 def _gather(world: World, points: F32, normals: F32, rays: int) -> tuple[F32, npt.NDArray[np.bool_]]:
-    """Return the light of one bounce plus ambient light (L, 3), and which texels are visible at all (L,)."""
+    """Return the light of one bounce plus ambient light (L, 3), and the mask (L,) of the texels that are visible."""
     count = len(points)
     result = np.zeros((count, 3), np.float32)
     inside = np.zeros(count, np.int32)
@@ -170,7 +170,7 @@ def _smooth(light: F32, valid: npt.NDArray[np.bool_], world: World) -> None:
         part = slice(int(first), int(first + width * height))
         known = valid[part].reshape(height, width).astype(np.float32)
         image = light[part].reshape(height, width, 3) * known[..., None]
-        # Unknown texels take the light of known neighbours: the blur is normalised and widened until all are filled.
+        # The blur is normalised over known texels and repeated until unknown ones have the light of their neighbours.
         total = cv2.GaussianBlur(image, (3, 3), 0.8, borderType=cv2.BORDER_REPLICATE).reshape(height, width, 3)
         share = cv2.GaussianBlur(known, (3, 3), 0.8, borderType=cv2.BORDER_REPLICATE)
         size = 3
@@ -209,9 +209,9 @@ def _baked(world: World, rays: int) -> F32:
 
 
 def bake_mesh(world: World) -> None:
-    """Compute ambient light with occlusion for a mesh from a file: ``light_linear`` of each triangle, on both sides.
+    """Compute ``light_linear`` of each triangle of a mesh file, on both sides: ambient light with occlusion.
 
-    The mesh has no lamps, so the light is a soft sky inside the rooms, stronger from above and dimmer near objects.
+    The mesh has no lamps, so the rooms get the light of a soft sky, stronger from above and dimmer near objects.
     """
     triangles = world.vertices[world.faces].astype(np.float64)
     count = len(triangles)
@@ -236,7 +236,7 @@ def bake_mesh(world: World) -> None:
 
 
 def affine_on_triangles(triangles: npt.NDArray[np.float64], values: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
-    """Return the affine functions of a point that have the given values at the corners, constant along the normal.
+    """Return the affine functions of a point that take given values at the corners and are constant along the normal.
 
     Args:
         triangles: corners in metres, (F, 3, 3).

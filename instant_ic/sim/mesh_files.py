@@ -13,7 +13,7 @@ from instant_ic.sim.world import World
 
 
 def _spawn(world: World) -> tuple[float, float, float]:
-    """Return the centre of the largest free area of the floor plan that has a floor and something overhead."""
+    """Return the centre of the largest free area of the floor plan that has a floor below and a surface above."""
     mask = world.occupied(0.05, 1.9, 0.05)
     clearance = mask.distance_m()
     candidates = np.argwhere(clearance > 0.3)
@@ -44,7 +44,7 @@ def load_world(path: str | Path) -> World:
     normal = cross / np.linalg.norm(cross, axis=1, keepdims=True)
     tint = np.where(mesh.texture[:, None] < 0, srgb_to_linear(mesh.corner_rgb.mean(axis=1) / 255), np.float32(1))
     images = [srgb_to_linear(image.astype(np.float32) / 255) for image in mesh.images]
-    sources: list[str | npt.NDArray[np.floating]] = [*images, np.ones((1, 1, 3), np.float32)]  # the last is plain
+    sources: list[str | npt.NDArray[np.floating]] = [*images, np.ones((1, 1, 3), np.float32)]  # the last one is plain
     world = World(
         name=Path(path).name,
         vertices=mesh.triangles.reshape(-1, 3),

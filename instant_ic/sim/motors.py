@@ -1,8 +1,8 @@
-"""Track motors under the speed loops of the controller, with their power, current and encoders.
+"""Track motors under the speed loops of the controller, with power, current and encoders.
 
-A healthy loop is tuned: the track follows its set point with its lag and acceleration. The loop regulates the counted
-motion. Motion that the encoder does not count is an error, which the loop integrates (wind-up) until the power
-saturates: with a dead encoder the track runs away, with a reversed one it does so at once.
+With a healthy encoder, a track follows its set point with a lag and a limited acceleration. The loop regulates the
+counted motion: motion that the encoder does not count is an error, which the loop integrates (wind-up) until the power
+saturates. With a dead encoder the track therefore runs away, and with a reversed one it does so at once.
 """
 
 import math
@@ -25,7 +25,7 @@ class TrackMotors:
     """Motors of the left and the right track.
 
     Args:
-        acceleration: largest acceleration of a track by its motor, m/s².
+        acceleration: largest acceleration that the motor gives a track, m/s².
         lag_s: time constant with which a track follows its set point, seconds.
         resistance: deceleration of a track by friction, m/s².
         seed: seed of the noise of the currents.
@@ -65,8 +65,8 @@ class TrackMotors:
         """Advance the motors.
 
         Args:
-            setpoint_m_s: set points of the speed loops (2,), or with ``closed_loop`` False the speeds that the power
-                gives without load.
+            setpoint_m_s: set points of the speed loops (2,); with ``closed_loop`` False the speeds without load that
+                the power would give.
             dt_s: duration of the step in seconds.
             closed_loop: True while the speed loops regulate.
 
@@ -98,7 +98,7 @@ class TrackMotors:
         return mean
 
     def _follow(self, speeds: FloatArray, wanted: FloatArray, dt_s: float) -> FloatArray:
-        """Return the speeds after ``dt_s`` of tracks that follow ``wanted``; at zero, friction ends the motion."""
+        """Return the speeds of tracks after following ``wanted`` for ``dt_s``; at zero, friction ends the motion."""
         most = self.acceleration * dt_s
         follow = (wanted - speeds) * (1 - math.exp(-dt_s / self.lag_s))
         followed = speeds + np.clip(follow, -most, most)

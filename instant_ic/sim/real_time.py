@@ -24,11 +24,11 @@ _STEP_S = 0.01
 _MAX_WAIT_S = 0.3
 """Longest wait for a running step at shutdown."""
 _MAX_LAG_S = 0.25
-"""Most simulated time to catch up on at once after a stall."""
+"""Longest lag that the simulation catches up after a stall; it pauses for the rest."""
 ACCEPTABLE_LAG_S = 0.15
-"""Lag of the simulation with which the stack still works as on a fast machine."""
+"""Largest lag of the simulation at which the stack works as on a fast machine."""
 _VISIBLE_MOTION = 1e-4
-"""Least motion that is rendered, metres and radians: a thirtieth of a pixel of the largest preview, 0.5 m ahead."""
+"""Smallest motion that is rendered, metres and radians: a thirtieth of a pixel of the largest preview, 0.5 m ahead."""
 
 
 @dataclass(frozen=True)
@@ -37,7 +37,7 @@ class SimulatorConfig(SimulationConfig):
 
     Attributes:
         panorama: image file that the camera shows instead of the world; empty: the world.
-        pcap: VLP-16 recording to send, again and again, instead of simulated packets; empty: the world.
+        pcap: VLP-16 recording that is sent repeatedly instead of simulated packets; empty: simulated packets.
     """
 
     panorama: str = ""
@@ -50,7 +50,7 @@ class SimulatedDevices:
     Args:
         simulation: robot and world.
         serial_folder: folder of the link to the motor controller's pseudo-terminal.
-        log: receives the devices' addresses.
+        log: log for the devices' addresses.
 
     Raises:
         ValueError, OSError, CaptureError: a device cannot be opened.
@@ -80,7 +80,7 @@ class SimulatedDevices:
             self.scanner = Vlp16Server(simulation.scanner)
         if config.camera.enabled:
             if not config.panorama:
-                self._see(config.camera.width, config.camera.height)  # compiles before the clock starts
+                self._see(config.camera.width, config.camera.height)  # compiles the kernels before the clock starts
             source = panorama_file(Path(config.panorama).expanduser()) if config.panorama else self._see
             self.camera = ThetaServer(config.camera, source, config.seed)
             log.info("Theta Web API on http://%s:%d", config.camera.host, self.camera.port)
@@ -95,7 +95,7 @@ class SimulatedDevices:
                 device.close()
 
     def _see(self, width: int, height: int) -> npt.NDArray[np.uint8]:
-        """Return the camera's view; it is not rendered again if the robot has not moved visibly."""
+        """Return the camera's view, rendered again only if the robot has moved visibly."""
         pose, rgb = self._simulation.robot.pose, self._seen
         if rgb.shape != (height, width, 3) or np.abs(pose - self._seen_from).max() > _VISIBLE_MOTION:
             self._seen, self._seen_from = self._simulation.panorama(width, height).rgb, pose
@@ -103,12 +103,12 @@ class SimulatedDevices:
 
 
 class RealTimeLoop:
-    """Keeps simulated time at the stack's time, in a thread of its own.
+    """A thread that keeps simulated time at the stack's time.
 
     Args:
-        simulation: it is stepped.
-        scanner: sends its complete packets after each step; None for none.
-        on_fault: called on the thread when a step fails; the loop has ended then.
+        simulation: simulation to step.
+        scanner: scanner whose complete packets are sent after each step; None: no scanner.
+        on_fault: function called on the thread when a step fails and the loop has ended.
 
     Attributes:
         fault: the error that ended the loop; None while it runs.
@@ -128,12 +128,12 @@ class RealTimeLoop:
         self._thread.start()
 
     def stop(self) -> None:
-        """End the loop; waits at most 0.3 s for a running step."""
+        """End the loop, waiting at most 0.3 s for a running step."""
         self._stopped.set()
         self._thread.join(_MAX_WAIT_S)
 
     def take_paused_s(self) -> float:
-        """Return the seconds for which the simulation has paused since the last call, because the machine stalled."""
+        """Return the seconds for which stalls of the machine have paused the simulation since the last call."""
         paused, self._paused_s = self._paused_s, 0.0
         return paused
 
@@ -154,7 +154,7 @@ class RealTimeLoop:
                     continue
                 self._lag_s = max(self._lag_s, lag)
                 if lag > _MAX_LAG_S:
-                    # The machine stalled: the robot stands too, and the devices pause instead of catching up.
+                    # The machine stalled. Robot and devices pause instead of catching up.
                     self._paused_s += lag - _MAX_LAG_S
                     offset += lag - _MAX_LAG_S
                     simulation.start_ns += round((lag - _MAX_LAG_S) * 1e9)

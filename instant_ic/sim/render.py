@@ -1,4 +1,4 @@
-"""Renders anti-aliased panoramas and perspective images of a world, with depth."""
+"""Renderer of anti-aliased panoramas and perspective images of a world, with depth."""
 
 import math
 from dataclasses import dataclass
@@ -13,8 +13,8 @@ from instant_ic.sim.world import World
 
 FloatArray = npt.NDArray[np.floating]
 
-#: Share of a pixel over which a texture is averaged, in pixels on one surface and for the samples of edge pixels.
-#: It is below 1 because bilinear lookup also blurs.
+#: Width, in pixels, over which a texture is averaged, for pixels inside a surface and for samples of edge pixels.
+#: It is below 1 because the bilinear lookup blurs too.
 _FOOTPRINT = 0.65
 _EDGE_FOOTPRINT = 0.45
 
@@ -24,7 +24,7 @@ _Tables = tuple[npt.NDArray[np.float32], npt.NDArray[np.float32], npt.NDArray[np
 
 @dataclass(frozen=True)
 class RenderedFrame:
-    """Image with depth.
+    """An image with depth.
 
     Attributes:
         rgb: (H, W, 3) uint8 sRGB.
@@ -39,7 +39,7 @@ class RenderedFrame:
 def _tone_table() -> tuple[npt.NDArray[np.uint8], npt.NDArray[np.float32]]:
     """Return the table from square roots of radiance to sRGB, and the mean radiance of each sRGB value (256,).
 
-    Linear up to 0.6, then a soft shoulder, so that lamps turn white gradually.
+    The curve is linear up to 0.6, then bends softly, so that lamps turn white gradually.
     """
     radiance = ((np.arange(kernels.TONE_SIZE) + 0.5) * (kernels.TONE_ROOT / (kernels.TONE_SIZE - 1))) ** 2
     knee = 0.6
@@ -54,8 +54,8 @@ def _tone_table() -> tuple[npt.NDArray[np.uint8], npt.NDArray[np.float32]]:
 class _Lens:
     """Projection of an image: width, height, and horizontal field of view (None: equirect).
 
-    The direction of a pixel is ``scale[row] * across[:, column] + down[:, row]``, to be normalised in a perspective
-    image. The tables begin one row and one column before the image and end one after it.
+    The direction of a pixel is ``scale[row] * across[:, column] + down[:, row]``; in a perspective image it must be
+    normalised. The tables begin one row and one column before the image and end one after it.
     """
 
     width: int
@@ -85,9 +85,10 @@ class _Lens:
 
 @lru_cache(maxsize=8)
 def _strides(lens: _Lens) -> npt.NDArray[np.int32]:
-    """Return the columns per shaded pixel in each row; near the poles of a panorama columns lie close together.
+    """Return the number of columns per shaded pixel in each row (H,).
 
-    A stride covers at most the width of a pixel on the horizon.
+    It grows towards the poles of a panorama, where columns lie close together: a stride covers at most the width of a
+    pixel on the horizon.
     """
     if lens.hfov_rad is not None:
         return np.ones(lens.height, np.int32)
@@ -97,12 +98,12 @@ def _strides(lens: _Lens) -> npt.NDArray[np.int32]:
 
 
 class EquirectRenderer:
-    """Renders a world from any pose.
+    """A renderer of a world from any pose.
 
     Rays are cast for every fourth pixel in each direction, and for every second one where neighbours show different
     surfaces; the pixels in between show one of the surfaces around them. The coverage of a pixel on an edge is sampled
-    at eight points. Near the poles of a panorama only every second, fourth... pixel of a row is shaded, and the colours
-    in between are interpolated. The world's light is read when the renderer is made.
+    at eight points. Near the poles of a panorama, only every second or fourth (and so on) pixel of a row is shaded, and
+    the colours in between are interpolated. The world's light is read when the renderer is made.
     """
 
     def __init__(self, world: World) -> None:
@@ -130,15 +131,16 @@ class EquirectRenderer:
         Args:
             map_from_camera: pose of the camera (x forward, y left, z up), (4, 4).
             width: columns of the image.
-            height: rows of the image; usually half as many.
-            supersample: render at this multiple of the size and area-average; depth is taken at the centre instead.
+            height: rows of the image; usually half the columns.
+            supersample: factor by which the rendered image is larger before it is area-averaged; depth is taken at the
+                pixel's centre.
         """
         return self._image(np.asarray(map_from_camera), _Lens(width, height), supersample)
 
     def render_perspective(
         self, map_from_camera: FloatArray, width: int, height: int, hfov_rad: float, supersample: int = 1
     ) -> RenderedFrame:
-        """Render a perspective image along the camera's x with square pixels; depth is radial too."""
+        """Render a perspective image along the camera's x axis, with square pixels and radial depth."""
         if not 0 < hfov_rad < math.pi:
             raise ValueError(f"hfov_rad must be between 0 and pi (got {hfov_rad})")
         return self._image(np.asarray(map_from_camera), _Lens(width, height, hfov_rad), supersample)
@@ -156,7 +158,7 @@ class EquirectRenderer:
             return self._frame(map_from_camera, lens)
         n = supersample
         fine = self._frame(map_from_camera, _Lens(lens.width * n, lens.height * n, lens.hfov_rad))
-        # Averaged as radiance and clipped at white like a sensor, so that lamps keep smooth borders.
+        # Pixels are averaged as radiance, clipped at white as by a sensor, so that lamps have smooth edges.
         table, radiance = _tone_table()
         parts = np.minimum(radiance, 1.5)[fine.rgb].reshape(lens.height, n, lens.width, n, 3)
         index = np.sqrt(parts.mean(axis=(1, 3))) * ((kernels.TONE_SIZE - 1) / kernels.TONE_ROOT)

@@ -14,18 +14,18 @@ log = logging.getLogger(__name__)
 
 
 class RoboClawServer:
-    """Serves an emulated controller on a pseudo-terminal.
+    """A server of an emulated controller on a pseudo-terminal.
 
     Args:
-        emulator: the controller; the robot simulation advances its time.
-        lock: held during each access to the emulator.
+        emulator: the controller, whose time the robot simulation advances.
+        lock: lock to hold during each access to the emulator.
         link: symbolic link to create to the terminal, replaced if it exists; None creates no link.
     """
 
     def __init__(self, emulator: RoboclawEmulator, lock: threading.Lock, link: Path | None = None) -> None:
         self._emulator = emulator
         self._lock = lock
-        # The slave end stays open here, so that the master sees no hang-up when a driver closes its end.
+        # This process keeps the slave end open, so that the master sees no hang-up when a driver closes it.
         self._master, self._slave = os.openpty()
         tty.setraw(self._slave)
         self.device = os.ttyname(self._slave)
@@ -57,7 +57,7 @@ class RoboClawServer:
             with self._lock:
                 reply = self._emulator.feed(data)
             while reply:
-                # A driver that sends requests and never reads must not block the simulator.
+                # A driver that sends requests but never reads must not block the simulator.
                 _, writable, _ = select.select([], [self._master], [], 0.5)
                 if not writable:
                     log.warning("%s: %d bytes of a reply were not read and are dropped", self.device, len(reply))

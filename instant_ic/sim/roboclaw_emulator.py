@@ -1,4 +1,4 @@
-"""RoboClaw emulated in memory: request bytes in, reply bytes out.
+"""A RoboClaw emulated in memory: request bytes in, reply bytes out.
 
 The emulator has no clock and no port. The caller feeds it bytes and advances its time with
 `RoboclawEmulator.advance`.
@@ -26,24 +26,25 @@ from instant_ic.base.protocol import (
 
 MAX_SPEED_PPS = 4000.0
 _STEEPEST, _STEEPEST_S = 655359, 0.05
-"""Largest ramp of command 54, and its time from full power to none."""
+"""Largest ramp of command 54, and the time that it takes from full power to none."""
 _SPEED_ERRORS = (0x0100, 0x0200)
 """Status bits of the motors' speed errors."""
 
 
 class RoboclawEmulator:
-    """State of the controller and of two motors with encoders.
+    """The controller and two motors with encoders.
 
-    The motors follow `setpoint_pps` exactly unless ``ideal_motors`` is False; then the robot simulation writes
+    The motors follow `setpoint_pps` exactly if ``ideal_motors`` is True. Otherwise the robot simulation writes
     `speed_pps`, `encoder`, `power` and `currents_a`.
 
     Attributes:
         target_speed_pps: target speed of the last command, pulses/s, (2,) M1 and M2.
         acceleration_pps2: ramp of the last command, pulses/s^2; 0 means no ramp.
         setpoint_pps: target after the ramp, pulses/s, (2,).
-        closed_loop: True while the speed loops regulate; otherwise the set points are power, as the speed without load.
+        closed_loop: True while the speed loops regulate; otherwise the set points are power, given as the speed without
+            load.
         speed_pps: speed measured by the encoders, pulses/s, (2,).
-        encoder: counted pulses, (2,); replies carry them modulo 2^32.
+        encoder: counted pulses, (2,); replies contain them modulo 2^32.
         power: power on the motors, -1 to 1, (2,).
         currents_a: currents of the motors, amperes, (2,).
         battery_v: main battery, volts.
@@ -53,10 +54,10 @@ class RoboclawEmulator:
         speed_error_limits: largest differences of speed and set point, pulses/s, (2,); 0 is off. An error lasts until
             a restart.
         limit_bytes: length of each limit in commands 109 and 110: 2 or 4; 0 for firmware without them.
-        timeout_s: serial watchdog; 0 is off.
-        watchdog_fired: True after the watchdog stopped the motors; the next valid packet resets it.
-        bad_packets: frames dropped for their CRC, an unknown command or a gap between bytes.
-        packets: valid frames.
+        timeout_s: time-out of the serial watchdog; 0 is off.
+        watchdog_fired: True after the watchdog has stopped the motors, until the next valid packet.
+        bad_packets: number of frames dropped because of their CRC, an unknown command or a gap between bytes.
+        packets: number of valid frames.
     """
 
     def __init__(self, address: int = 0x80, ideal_motors: bool = True) -> None:
@@ -88,7 +89,7 @@ class RoboclawEmulator:
         self._since_packet_s = 0.0
 
     def feed(self, data: bytes) -> bytes:
-        """Take bytes from the line and return the controller's replies in order."""
+        """Process bytes from the line and return the controller's replies in order."""
         if data:
             self._silent_s = 0.0
         self._received += data
@@ -98,7 +99,7 @@ class RoboclawEmulator:
         return bytes(sent)
 
     def advance(self, dt_s: float) -> None:
-        """Advance the time of byte gap, watchdog, speed ramps and, for ideal motors, the encoders."""
+        """Advance the time of the byte gap, the watchdog, the speed ramps and, for ideal motors, the encoders."""
         self._silent_s += dt_s
         if self._received and self._silent_s > INTER_BYTE_GAP_S:
             self._received.clear()
@@ -121,7 +122,7 @@ class RoboclawEmulator:
             self.encoder += 0.5 * (before + self.setpoint_pps) * dt_s
 
     def press(self, pressed: bool, pin: str = "S3") -> None:
-        """Press or release the robot's stop button; with a latching pin the stop lasts until a restart."""
+        """Press or release the robot's stop button. On a latching pin, the stop lasts until a restart."""
         bit, mode = ESTOP_BITS[self.status_bytes], self.pins[PINS.index(pin)]
         latching = latches(mode, pin, self.status_bytes)
         if pressed and (latching or mode == (0x01 if self.status_bytes == 4 else 0x02)):
@@ -151,7 +152,7 @@ class RoboclawEmulator:
             return None
         address, command = received[0], received[1]
         if address != self.address:
-            # Another controller's packet, or noise: its end is unknown, so wait for the next one.
+            # A packet for another controller, or noise. Its end is unknown, so the rest is dropped.
             received.clear()
             self.bad_packets += 1
             return None

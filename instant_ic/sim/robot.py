@@ -17,7 +17,7 @@ from instant_ic.sim.motors import TrackMotors
 
 FloatArray = npt.NDArray[np.float64]
 
-#: A contact ends when the robot is this far from its pose at contact, metres and radians.
+#: Distance from the pose at contact at which the contact ends, metres and radians.
 _LET_GO = 0.015
 #: Time constant of the slip.
 _SLIP_TIME_S = 1.0
@@ -28,12 +28,12 @@ class RobotConfig(Checked):
     """Parameters of the simulated robot.
 
     Attributes:
-        track_acceleration: largest acceleration of a track by its motor, m/s².
+        track_acceleration: largest acceleration that the motor gives a track, m/s².
         motor_lag_s: time constant with which a track follows its set point.
-        rolling_resistance: deceleration of a track by friction, m/s². The speed controller compensates for it, except
-            at set point zero, where friction ends the motion.
+        rolling_resistance: deceleration of a track by friction, m/s². The speed controller compensates for friction,
+            except at set point zero, where friction ends the motion.
         slip: standard deviation of the share of a track's motion that is lost; 0 disables slip.
-        turn_slip: relative standard deviation of the effective track width; 0 disables it.
+        turn_slip: relative standard deviation of the effective track width; 0 disables this slip.
         encoder_noise_pulses: standard deviation of the encoder counts while a track moves.
     """
 
@@ -46,10 +46,10 @@ class RobotConfig(Checked):
 
 
 class TrackedRobot:
-    """Robot on the floor plan.
+    """The robot on the floor plan.
 
     Args:
-        mask: places where objects stop the robot.
+        mask: floor plan of the objects that stop the robot.
         pose: x, y, yaw at the start.
         seed: seed of slip and noise.
         footprint: outline.
@@ -114,7 +114,7 @@ class TrackedRobot:
         """Place the robot at another pose (x, y, yaw).
 
         Raises:
-            ValueError: the pose is not finite, or something stands there.
+            ValueError: the pose is not finite, or an object is in the way.
         """
         if not np.isfinite(pose).all() or self.touches(pose):
             raise ValueError(f"the pose x={pose[0]:.2f}, y={pose[1]:.2f} collides with the world")

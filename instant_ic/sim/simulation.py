@@ -106,7 +106,7 @@ class Simulation:
         self.scanner = Vlp16(config.lidar, self.world, self.poses_at, self.epoch_ns, config.seed, config.lidar_mount)
 
     def epoch_ns(self, time_s: float) -> int:
-        """Return the epoch time of a simulated time; ``start_ns`` is shifted after a pause of the simulation."""
+        """Return the epoch time of a simulated time. After a pause of the simulation, ``start_ns`` is shifted."""
         return self.start_ns + round(time_s * 1e9)
 
     def step(self, dt_s: float) -> None:
@@ -138,7 +138,7 @@ class Simulation:
         """Lift the robot and put it down at another pose (x, y, yaw); tracks and encoders do not notice.
 
         Raises:
-            ValueError: something stands there.
+            ValueError: an object is in the way.
         """
         with self.lock:
             self.robot.put_down(pose)
@@ -169,7 +169,7 @@ class Simulation:
 
 
 def drive(robot: TrackedRobot, controller: RoboclawEmulator, dt_s: float) -> None:
-    """Advance the robot by its controller's demands, and give the controller its measurements."""
+    """Advance the robot under its controller's demands, and give the controller the measurements."""
     motors, kinematics = robot.motors, robot.kinematics
     motors.battery_v = controller.battery_v
     robot.step(controller.setpoint_pps, dt_s, controller.closed_loop)

@@ -16,7 +16,7 @@ from instant_ic.sim.kept import Arrays, kept
 
 FloatArray = npt.NDArray[np.floating]
 
-#: Two levels an octave.
+#: Largest number of levels, two per octave.
 MAX_LEVELS = 24
 
 
@@ -54,7 +54,7 @@ def _halve(image: FloatArray) -> npt.NDArray[np.float32]:
 
 
 def pyramid(albedo: FloatArray) -> list[npt.NDArray[np.float32]]:
-    """Return the mip levels of a linear-light image (H, W, 3), two an octave, down to one texel."""
+    """Return the mip levels of a linear-light image (H, W, 3), two per octave, down to one texel."""
     import cv2
 
     levels = [np.asarray(albedo, np.float32)]
@@ -94,7 +94,7 @@ def _packed(
 
 
 def texture_set(sources: list[str | FloatArray], clamped: list[bool]) -> TextureSet:
-    """Make a texture set of named procedural textures (str) and linear-light images (H, W, 3) in 0..1."""
+    """Make a texture set from names of procedural textures and linear-light images (H, W, 3) in 0..1."""
     count = len(sources)
     offset = np.zeros((count, MAX_LEVELS), np.int64)
     size = np.ones((count, MAX_LEVELS, 2), np.int32)
@@ -160,7 +160,7 @@ def _wallpaper(rng: np.random.Generator) -> FloatArray:
 def _courses(
     rng: np.random.Generator, n: int, rows: int, tones: tuple[float, float], joint: float
 ) -> tuple[FloatArray, FloatArray]:
-    """Make masonry: the tones of stones twice as long as high, and 0 in their joints to 1 on them, (n, n) each."""
+    """Make masonry of stones twice as long as high: their tones, and a mask of 0 in joints and 1 on stones, (n, n)."""
     columns = rows // 2
     y, x = np.mgrid[0:n, 0:n] / n
     row = np.floor(y * rows).astype(int)
@@ -409,7 +409,7 @@ def _lamp(rng: np.random.Generator) -> FloatArray:
     return _grey(0.94 + 0.05 * np.sin(2 * np.pi * 16 * x) * np.sin(2 * np.pi * 16 * y))
 
 
-#: By name. The order is part of each texture's seed: new ones come last.
+#: Generators of textures by name. Their order is part of each texture's seed, so new ones must come last.
 _GENERATORS: dict[str, Callable[[np.random.Generator], FloatArray]] = {
     make.__name__.removeprefix("_"): make
     for make in (
@@ -426,7 +426,7 @@ def make_texture(name: str) -> npt.NDArray[np.float32]:
     """Make the linear albedo (H, W, 3) of a texture named ``kind`` or ``kind:variant`` (variant: an integer seed).
 
     Raises:
-        ValueError: there is no such kind.
+        ValueError: the kind is unknown.
     """
     kind, _, variant = name.partition(":")
     if kind not in _GENERATORS:

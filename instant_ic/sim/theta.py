@@ -22,13 +22,13 @@ from instant_ic.util.pace import current
 log = logging.getLogger(__name__)
 
 BOUNDARY = "---osclivepreview---"
-#: Delay of an image with which the stack still works as with a punctual camera, seconds.
+#: Largest delay of an image in seconds at which the stack works as with a punctual camera.
 ACCEPTABLE_DELAY_S = 0.06
 JPEG_QUALITY = 92
-#: Standard deviation of the sensor's noise, of 255: no two images are equal. It makes a JPEG 2 % larger.
+#: Standard deviation of the sensor's noise, out of 255, so that no two images are equal. It makes a JPEG 2 % larger.
 NOISE = 1.0
 _NOISE_STEP = 389
-"""Columns by which the noise moves from image to image: a prime, so that it repeats only after the whole width."""
+"""Number of columns by which the noise moves per image; a prime, so that it repeats only after the whole width."""
 #: Time after setting options during which the preview is not ready, seconds.
 SETTLE_S = 0.8
 
@@ -40,8 +40,8 @@ class SimThetaConfig:
     Attributes:
         enabled: whether the camera is simulated.
         host, port: address of its Web API; port 0 selects a free one.
-        width, height: preview format until a driver sets another.
-        rate: largest frame rate, even if the format promises more.
+        width, height: preview format until a driver sets another one.
+        rate: largest frame rate, even if the format allows more.
         latency_s: time from the exposure of an image to its delivery.
     """
 
@@ -60,12 +60,12 @@ class SimThetaConfig:
         check_ranges(self)
 
 
-#: Returns the camera's current view for a width and height: panorama (H, W, 3), sRGB, without the sensor's noise.
+#: Function that returns the camera's view for a width and height: panorama (H, W, 3), sRGB, without sensor noise.
 ImageSource = Callable[[int, int], npt.NDArray[np.uint8]]
 
 
 def panorama_file(path: str | Path) -> ImageSource:
-    """Return a source that always gives one panorama file, area-averaged to the requested size.
+    """Return a source that always gives the panorama of a file, area-averaged to the requested size.
 
     Raises:
         ValueError: the file cannot be decoded as an image.
@@ -87,9 +87,9 @@ def panorama_file(path: str | Path) -> ImageSource:
 
 
 class ThetaServer:
-    """Camera with its Web API; it renders images only while a client reads the preview.
+    """A camera with its Web API, which renders images only while a client reads the preview.
 
-    Its source is called on the camera's thread. Each image has noise, of the seed.
+    The image source is called on the camera's thread. ``seed`` is that of the noise in each image.
 
     Raises:
         OSError: the port is in use.
@@ -98,8 +98,8 @@ class ThetaServer:
         port: listening port.
         rate_hz: recent frame rate; 0 without a viewer and for the first four frames.
         frames: number of delivered images.
-        stopping: the camera is closing.
-        late_s: recent delay of the images behind their plan, in the stack's seconds; 0 without a viewer.
+        stopping: True while the camera is closing.
+        late_s: recent delay of the images behind schedule, in the stack's seconds; 0 without a viewer.
     """
 
     def __init__(self, config: SimThetaConfig, source: ImageSource, seed: int = 0) -> None:
@@ -112,7 +112,7 @@ class ThetaServer:
         self.frames = 0
         self.late_s = 0.0
         self._options = ThetaOptions(next(f for f in PREVIEW_FORMATS if f[:2] == (config.width, config.height)))
-        # Options as the driver left them in its last run: a camera that stays on keeps them.
+        # A camera that stays on keeps the options of the driver's last run.
         self._options.set({"sleepDelay": NEVER, "offDelay": NEVER})
         self._options_set_s = -1e9
         self._frame: bytes | None = None
@@ -155,7 +155,7 @@ class ThetaServer:
         self._http.shutdown()
         self._http.server_close()
         for thread in self._threads:
-            # Do not wait for an image in progress on a busy machine: no client gets it, and the thread is a daemon.
+            # An image in progress on a busy machine is not waited for: no client needs it, and the thread is a daemon.
             thread.join(0.3)
 
     # --- images -------------------------------------------------------------------------------------
@@ -166,8 +166,7 @@ class ThetaServer:
         height, width = rgb.shape[:2]
         if self._noise.shape[:2] != (height, 2 * width):
             self._noise = np.rint(self._rng.normal(0.0, NOISE, (height, 2 * width, 3))).astype(np.int8)
-        # The offsets take turns: at random, one of them would soon be repeated, and the image of a standing robot would
-        # be equal to an earlier one.
+        # The offsets take turns. Random offsets would soon repeat, and two images of a standing robot would be equal.
         self._noise_first = (self._noise_first + _NOISE_STEP) % width
         first = self._noise_first
         noisy = cv2.add(rgb, self._noise[:, first : first + width], dtype=cv2.CV_8U)
@@ -199,18 +198,18 @@ class ThetaServer:
                 self.frames += 1
                 self._changed.notify_all()
             period = 1.0 / min(self.config.rate, promised)
-            # If rendering takes too long, the camera delivers fewer images, never old ones.
+            # If rendering takes too long, the camera delivers fewer images, but never old ones.
             due += period
             late_s = min(
                 max(late_s, current().steady_s() - due, 0.0), period
-            )  # a single late image does not mean a slow machine
+            )  # because a single late image does not mean a slow machine
             self.late_s = 0.5 * self.late_s + 0.5 * late_s
             due = max(due, current().steady_s())
             self._sleep(due)
             took = current().steady_s() - began
             made += 1
             period_s = took if made == 1 else 0.8 * period_s + 0.2 * took
-            # The first images are late at any start, so the rate is reported only after them.
+            # The first images are always late, so the rate is reported only after them.
             if made >= 5:
                 self.rate_hz = 1 / period_s
 
@@ -221,7 +220,7 @@ class ThetaServer:
                 self._changed.wait(current().wait_s(left))
 
     def next_frame(self, after: int, timeout_s: float) -> tuple[int, bytes] | None:
-        """Return number and JPEG of the newest image after number ``after``; None on a time-out or at shutdown."""
+        """Return the number and JPEG of the newest image after image ``after``; None on a time-out or at shutdown."""
         deadline = time.monotonic() + timeout_s
         with self._changed:
             while (self._number <= after or self._frame is None) and not self.stopping:
@@ -270,10 +269,10 @@ class ThetaServer:
         raise OptionError("unknownCommand", f"command {name} is not known")
 
     def open_preview(self) -> int:
-        """Add a viewer and return the number of the newest image, which this viewer does not get.
+        """Add a viewer and return the number of the newest image; the viewer gets the images after it.
 
         Raises:
-            OptionError: the camera is not ready after a change of options.
+            OptionError: the camera is not ready yet after a change of options.
         """
         if time.monotonic() - self._options_set_s < SETTLE_S:
             raise OptionError("serviceUnavailable", "the camera is changing its settings", 503)
@@ -289,11 +288,11 @@ class ThetaServer:
 
 
 class _Handler(BaseHTTPRequestHandler):
-    """One connection to the camera."""
+    """A connection to the camera."""
 
     camera: ThetaServer
     protocol_version = "HTTP/1.1"
-    # A client that stops reading is disconnected after this time, seconds.
+    # Seconds after which a client that stops reading is disconnected.
     timeout = 30.0
 
     def log_message(self, format: str, *args: Any) -> None:

@@ -11,7 +11,7 @@ from typing import Any
 from instant_ic.camera.config import FORMATS_FIRMWARE, OLD_PREVIEW_FORMATS, PREVIEW_FORMATS
 
 NEVER = 65535
-"""Delay that disables sleeping or switching off; reported as 0."""
+"""Delay that disables sleeping or switching off; the camera reports it as 0."""
 
 
 class OptionError(ValueError):
@@ -28,10 +28,10 @@ class OptionError(ValueError):
 
 
 class ThetaOptions:
-    """Options of a camera with a firmware.
+    """Options of a camera with a given firmware.
 
     Attributes:
-        values: options as they were set.
+        values: options as set by the client.
         preview: width, height and frame rate of the preview.
         formats: preview formats that the firmware offers.
     """
@@ -43,10 +43,10 @@ class ThetaOptions:
         self.values: dict[str, Any] = {"captureMode": "image", "sleepDelay": 300, "offDelay": 600}
 
     def set(self, options: Any) -> None:
-        """Set options, all or none.
+        """Set all the given options, or none of them.
 
         Raises:
-            OptionError: one is unknown or has a value that the camera does not accept.
+            OptionError: an option is unknown or has a value that the camera does not accept.
         """
         if not isinstance(options, dict) or not options:
             raise OptionError("missingParameter", "options is missing")
@@ -65,7 +65,7 @@ class ThetaOptions:
         """Return options as the camera reports them.
 
         Raises:
-            OptionError: one is unknown.
+            OptionError: an option is unknown.
         """
         known = {
             **{name: 0 if value == NEVER else value for name, value in self.values.items()},

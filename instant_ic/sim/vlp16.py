@@ -1,4 +1,4 @@
-"""VLP-16 as UDP packets: rays with firing times and motion distortion."""
+"""A simulated VLP-16: UDP packets of rays with firing times and motion distortion."""
 
 import contextlib
 import math
@@ -24,9 +24,9 @@ FloatArray = npt.NDArray[np.float64]
 F32 = npt.NDArray[np.float32]
 #: Revolutions per minute.
 RPM = 600.0
-#: A nearer surface gives no return, metres.
+#: Range in metres below which a surface gives no return.
 MIN_RANGE_M = 0.2
-#: Returns x, y, yaw (N, 3) of base_link at simulated times (N,) in seconds.
+#: Function that returns x, y, yaw (N, 3) of base_link at simulated times (N,) in seconds.
 PoseAt = Callable[[FloatArray], FloatArray]
 
 
@@ -39,8 +39,8 @@ class Vlp16Config(Checked):
         host: destination of the packets.
         data_port, position_port: destination UDP ports.
         range_noise: standard deviation of a range, metres.
-        max_range: a surface farther away gives no return, metres.
-        burst: packets sent together (1.33 ms each); larger bursts need less CPU.
+        max_range: range in metres above which a surface gives no return.
+        burst: number of packets sent together (1.33 ms each); larger bursts need less CPU.
     """
 
     enabled: bool = True
@@ -56,20 +56,20 @@ class Vlp16Config(Checked):
 def _place_beams(
     beams: F32, azimuth_rad: FloatArray, pose: FloatArray, base_from_lidar: FloatArray, origins: F32, directions: F32
 ) -> None:
-    """Enter the world origins and directions (P · B, 3) of the beams of P packets.
+    """Write the world origins and directions (P · B, 3) of the beams of P packets.
 
     Args:
         beams: direction in the sensor's frame at azimuth 0, share of the packet's time, height over the origin, (B, 5).
         azimuth_rad: azimuth at the start of each packet, (P,).
         pose: x, y, yaw of base_link at the start of each packet and the end of the last one, (P + 1, 3).
-        base_from_lidar: mount, (4, 4).
+        base_from_lidar: pose of the sensor on base_link, (4, 4).
         origins: result, (P · B, 3).
         directions: result, (P · B, 3).
     """
     mount = base_from_lidar.astype(np.float32)
     for p in range(azimuth_rad.shape[0]):
         c0, s0 = np.float32(math.cos(pose[p, 2])), np.float32(math.sin(pose[p, 2]))
-        # A packet takes 1.3 ms: the chord instead of the arc is exact to a micrometre at 10 m.
+        # A packet takes 1.3 ms, so the chord of the robot's arc is exact to a micrometre at 10 m.
         c1 = np.float32(math.cos(pose[p + 1, 2])) - c0
         s1 = np.float32(math.sin(pose[p + 1, 2])) - s0
         x0, y0 = np.float32(pose[p, 0]), np.float32(pose[p, 1])
@@ -103,15 +103,15 @@ def _measure(
     distance: npt.NDArray[np.uint16],
     reflectivity: npt.NDArray[np.uint8],
 ) -> None:
-    """Enter distance (N,), in units of 2 mm, and reflectivity (N,) of beams; both stay 0 without a return.
+    """Write distance (N,), in units of 2 mm, and reflectivity (N,) of beams; both stay 0 without a return.
 
     Args:
         range_m: true ranges, (N,).
         face: faces that the beams hit, (N,).
         directions: unit directions of the beams, (N, 3).
         noise_m: noise of the ranges, (N,).
-        limits_m: smallest and largest range that is measured.
-        surfaces: surface of each face (F,), normals (S, 3) and reflectances (S,) of the surfaces.
+        limits_m: smallest and largest range that the sensor measures.
+        surfaces: surface of each face (F,), and normals (S, 3) and reflectances (S,) of the surfaces.
         distance: result, (N,).
         reflectivity: result, (N,).
     """
@@ -129,12 +129,12 @@ def _measure(
 
 
 class Vlp16:
-    """Optics and clock of the scanner: produces packets for intervals of simulated time.
+    """Optics and clock of the scanner, which makes packets for intervals of simulated time.
 
     Args:
-        pose_at: pose of base_link at given times.
-        epoch_ns: epoch time of a simulated time, which gives the packets' microseconds past the hour.
-        mount: pose on base_link.
+        pose_at: function that returns the pose of base_link at given times.
+        epoch_ns: function that returns the epoch time of a simulated time, for the packets' time stamps.
+        mount: pose of the sensor on base_link.
     """
 
     def __init__(
@@ -179,18 +179,18 @@ class Vlp16:
         return (self.packets + 1) * wire.PACKET_PERIOD_US * 1e-6
 
     def skip_to(self, time_s: float) -> int:
-        """Skip the packets that begin before a time and return their number."""
+        """Skip the packets that begin before ``time_s`` and return their number."""
         target = math.ceil(time_s / (wire.PACKET_PERIOD_US * 1e-6))
         skipped = max(0, target - self.packets)
         self.packets += skipped
         return skipped
 
     def due(self, time_s: float) -> int:
-        """Return the number of packets that are complete at a time and not yet made."""
+        """Return the number of packets that are complete at ``time_s`` but not yet made."""
         return max(0, math.floor(time_s / (wire.PACKET_PERIOD_US * 1e-6)) - self.packets)
 
     def make(self, count: int) -> list[bytes]:
-        """Make the next ``count`` data packets; the poses up to the end of the last one must be known."""
+        """Make the next ``count`` data packets. The poses up to the end of the last packet must be known."""
         if count < 1:
             return []
         config, period_s = self.config, wire.PACKET_PERIOD_US * 1e-6
@@ -241,11 +241,11 @@ class Vlp16:
 
 
 class Vlp16Server:
-    """Sends the scanner's packets over UDP as simulated time advances.
+    """A sender of the scanner's packets over UDP as simulated time advances.
 
     Attributes:
-        sent: data packets sent.
-        skipped: data packets skipped because the machine was too slow.
+        sent: number of data packets sent.
+        skipped: number of data packets skipped because the machine was too slow.
     """
 
     POSITION_PERIOD_S = 0.1
@@ -279,6 +279,6 @@ class Vlp16Server:
         self._socket.close()
 
     def _send(self, payload: bytes, port: int) -> None:
-        # No listener yet: the kernel reports the error of an earlier packet. A real sensor ignores it too.
+        # Without a listener, the kernel reports the error of an earlier packet here. A real sensor ignores it.
         with contextlib.suppress(ConnectionRefusedError):
             self._socket.sendto(payload, (self._config.host, port))

@@ -1,4 +1,4 @@
-"""World: triangle mesh of planar surfaces with filtered textures and baked light."""
+"""A world: a triangle mesh of planar surfaces with filtered textures and baked light."""
 
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -29,12 +29,12 @@ class World:
         offset: (S,) float32, normal · p for points p on the surface.
         uv: (S, 2, 4) float32; (u, v) = uv @ (x, y, z, 1) in texture repeats, v downwards.
         texture: (S,) int32, index into ``textures``.
-        tint: (S, 3) float32, factor of the texture's albedo.
-        emission: (S,) float32; a surface with a value above 0 emits this radiance and ignores light.
+        tint: (S, 3) float32, factor on the texture's albedo.
+        emission: (S,) float32 emitted radiance; a surface with a value above 0 ignores other light.
         light_at: (S, 3) int64: first texel, width and height in ``light``; width 0 selects ``light_linear``.
         light_uv: (S, 2, 4) float32; maps a point to light texel coordinates.
         light_linear: (S, 4) float32; light of a point on a surface without a light map (meshes from files).
-        light: (L, 3) float32 baked irradiance; times albedo it is radiance.
+        light: (L, 3) float32 baked irradiance / pi, so that albedo times light is the radiance.
         spawn: start pose (x, y, yaw) of a robot.
         zones: rectangles (x0, y0, x1, y1, height) of free space from which the world was built, if any.
     """
@@ -64,16 +64,16 @@ class World:
 
     @cached_property
     def texel_per_m(self) -> npt.NDArray[np.float32]:
-        """Texels per metre of the finest level (S,), the larger of u and v."""
+        """Number of texels per metre of each surface's finest level (S,), the larger of u and v."""
         gradient = np.linalg.norm(self.uv[:, :, :3], axis=2)
         return np.asarray((gradient * self.textures.level_size[self.texture, 0]).max(axis=1), np.float32)
 
     @cached_property
     def forms(self) -> npt.NDArray[np.float32]:
-        """Affine functions of a point on each surface (S, 9, 4), each as (x, y, z, 1) coefficients.
+        """Nine affine functions of a point for each surface, as coefficients of (x, y, z, 1), (S, 9, 4).
 
-        0: distance from the plane; 1, 2: texture coordinates; 3, 4: coordinates in the light map, or 3: the light;
-        5-8: distances from the borders, positive inside.
+        0: distance from the plane; 1, 2: texture coordinates; 3, 4: coordinates in the light map, or, without a light
+        map, 3: the light; 5-8: distances from the borders, positive inside.
         """
         count = len(self.normal)
         corners = self.vertices.reshape(count, -1, 3).astype(np.float64)
@@ -88,14 +88,14 @@ class World:
         forms[:, 3:5] = self.light_uv
         without_map = self.light_at[:, 1] == 0
         forms[without_map, 3] = self.light_linear[without_map]
-        which = np.arange(4) % corners.shape[1]  # a triangle has its first border twice
+        which = np.arange(4) % corners.shape[1]  # a triangle's first border counts twice
         forms[:, 5:, :3] = inward[:, which]
         forms[:, 5:, 3] = -np.einsum("ski,ski->sk", inward, corners)[:, which]
         return forms
 
     @cached_property
     def adjoining(self) -> npt.NDArray[np.int32]:
-        """Surfaces (S, 4) that share a border with a surface of rectangles, -1 = none; (S, 0) for triangles."""
+        """Surfaces (S, 4) that share a border with each rectangle, -1 for none; (S, 0) in a world of triangles."""
         corners = np.rint(self.vertices.reshape(len(self.normal), -1, 3) * 1e4).astype(np.int64)
         if corners.shape[1] != 4:
             return np.zeros((len(corners), 0), np.int32)
@@ -113,7 +113,7 @@ class World:
         return np.asarray(others, np.int32)
 
     def occupied(self, low_m: float = 0.03, high_m: float = 0.9, cell_m: float = 0.02) -> OccupancyMask:
-        """Return the floor plan cells with a surface between two heights; they are kept after the first call."""
+        """Return the floor plan of the surfaces between two heights, which is cached."""
         key = (low_m, high_m, cell_m)
         if key not in self._masks:
             self._masks[key] = occupied_mask(self.vertices, self.faces, low_m, high_m, cell_m)
@@ -142,7 +142,7 @@ class World:
 
 @dataclass(frozen=True)
 class Material:
-    """Look of a surface: procedural texture, texture size in metres (0 = stretched over the surface), tint."""
+    """The look of a surface: procedural texture, texture size in metres (0: stretched over the surface), and tint."""
 
     texture: str
     size_m: float = 2.0
@@ -159,13 +159,13 @@ class _Panel:
 
 
 class WorldBuilder:
-    """Collects rectangles and builds a ``World`` from them; ``lighting.bake`` adds the light."""
+    """A collection of rectangles from which a ``World`` is built; ``lighting.bake`` adds the light."""
 
     def __init__(self) -> None:
         self.panels: list[_Panel] = []
 
     def panel(self, origin: npt.ArrayLike, along_u: npt.ArrayLike, along_v: npt.ArrayLike, material: Material) -> None:
-        """Add a rectangle; viewed from its front, ``origin`` is top left, ``along_u`` right, ``along_v`` down."""
+        """Add a rectangle. Seen from its front, ``origin`` is top left, ``along_u`` points right, ``along_v`` down."""
         self.panels.append(
             _Panel(np.asarray(origin, float), np.asarray(along_u, float), np.asarray(along_v, float), material)
         )
@@ -173,7 +173,7 @@ class WorldBuilder:
     def wall(
         self, start: tuple[float, float], end: tuple[float, float], low: float, high: float, material: Material
     ) -> None:
-        """Add a vertical rectangle whose front is on the right of start → end (left to right in front view)."""
+        """Add a vertical rectangle. Seen from its front, ``start`` is left and ``end`` right."""
         (x0, y0), (x1, y1) = start, end
         self.panel((x0, y0, high), (x1 - x0, y1 - y0, 0.0), (0.0, 0.0, low - high), material)
 
@@ -187,7 +187,7 @@ class WorldBuilder:
         top: Material | None = None,
         front: Material | None = None,
     ) -> None:
-        """Add a box that stands on z = ``low``; ``front`` is the side at +x of its own frame."""
+        """Add a box that stands on z = ``low``. ``front`` is the material of the side along its own x axis."""
         side = side or Material("white")
         c, s = np.cos(yaw), np.sin(yaw)
         x = np.asarray([c, s, 0.0]) * size[0] / 2
@@ -222,7 +222,7 @@ class WorldBuilder:
         for i, panel in enumerate(panels):
             size = panel.material.size_m
             if size > 0:
-                # Anchored to the world, so that the texture continues across neighbouring panels of one wall.
+                # The texture is anchored to the world, so that it continues across neighbouring panels of a wall.
                 level = textures.level_size[index[i], 0]
                 uv[i, 0, :3] = unit_u[i] / size
                 uv[i, 1, :3] = unit_v[i] / (size * level[1] / level[0])

@@ -25,8 +25,8 @@ def corridor_world(seed: int = 0, obstacle: bool = True, light_cell_m: float = 0
     walls. It is in the middle with its front 4 m ahead, which leaves 0.95 m free on either side.
 
     Args:
-        seed: changes the posters on the walls and the contents of the rooms, not the floor plan.
-        obstacle: whether to include the obstacle.
+        seed: seed of the posters on the walls and the contents of the rooms; the floor plan is always the same.
+        obstacle: include the obstacle.
         light_cell_m: resolution of the baked light.
     """
     rng = np.random.default_rng([11, seed])
@@ -78,7 +78,7 @@ def corridor_world(seed: int = 0, obstacle: bool = True, light_cell_m: float = 0
 
 
 def _fit_out_corridor(building: Building, arm: Zone, turn: Zone, rng: np.random.Generator, seed: int) -> None:
-    """Add closed doors along the corridor, windows at its ends, and posters in between."""
+    """Add closed doors along the corridor, windows at its ends, and posters between them."""
     building.closed_door(arm, "north", 8.7, 1)
     building.closed_door(arm, "north", 10.2, 2)
     building.closed_door(arm, "south", 2.2, 0)
@@ -171,7 +171,7 @@ def random_finish(rng: np.random.Generator) -> Finish:
 
 
 def plan(rng: np.random.Generator, building: Building, kind: str = "") -> list[Zone]:
-    """Add zones of one of five kinds of floor plan (empty: random); the spawn point is the first zone's centre."""
+    """Add the zones of one of five kinds of floor plan (empty: random). The first zone's centre is the spawn point."""
     drawn = rng.choice(["room", "hall", "corridor", "corner", "crossing"], p=[0.28, 0.12, 0.26, 0.18, 0.16])
     kind = kind or str(drawn)
     finish, height = random_finish(rng), rng.uniform(2.3, 3.4)
@@ -227,7 +227,7 @@ def side_room(
     centre = start[0] + sign_x * at if side in ("north", "south") else start[1] + sign_y * at
     width = rng.uniform(0.85, 1.2)
     door = building.door(zone, side, centre, wall, width)
-    # At most as wide as its share of the wall, so that neighbouring side rooms do not overlap.
+    # The room is at most as wide as its share of the wall, so that neighbouring side rooms do not overlap.
     left, right = min(at - low, 3.0) + 0.15, min(high - at, 3.0) + 0.15
     ends = sorted((centre - left, centre + right) if sign_x + sign_y > 0 else (centre + left, centre - right))
     rect = door.beyond(side, ends[0], ends[1], rng.uniform(2.2, 5.0))
@@ -325,7 +325,7 @@ def random_world(seed: int, light_cell_m: float = 0.25, rays: int = 20) -> World
     """Generate a random interior: room, hall, corridor, corner or crossing, with side rooms and furniture.
 
     Args:
-        seed: the same seed gives the same world.
+        seed: seed of the world; the same seed gives the same world.
         light_cell_m: resolution of the baked light.
         rays: rays per light texel.
     """
@@ -357,9 +357,12 @@ def interior(
 
 
 def long_world(seed: int, light_cell_m: float = 0.4, rays: int = 12) -> World:
-    """Generate a corridor (even seeds) or a hall (odd ones) of 20 to 40 m, with open doors to side rooms.
+    """Generate a corridor (even seeds) or a hall (odd seeds) of 20 to 40 m, with open doors to side rooms.
 
-    Args: as ``random_world``.
+    Args:
+        seed: seed of the world; the same seed gives the same world.
+        light_cell_m: resolution of the baked light.
+        rays: rays per light texel.
     """
     rng = np.random.default_rng([29, seed])
     building = Building()
@@ -388,7 +391,7 @@ def make_world(name_or_path: str) -> World:
     Names: ``corridor``, ``corridor:SEED``, ``corridor-free`` (no obstacle), ``random:SEED``, ``long:SEED``.
 
     Raises:
-        ValueError: neither a known name nor an existing file.
+        ValueError: the text is neither a known name nor an existing file.
     """
     name, _, argument = name_or_path.partition(":")
     if name in ("corridor", "corridor-free", "random", "long"):
