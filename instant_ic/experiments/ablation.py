@@ -61,7 +61,7 @@ def section(results: Sequence[Result], options: Options) -> Section:
 
 
 def _answer(results: Sequence[Result], better: str, worse: str) -> Answer:
-    """Return whether a source is above another in PSNR and SSIM in the mean from 0.5 to 2 m."""
+    """Answer whether a source is better than another in mean PSNR and SSIM from 0.5 to 2 m."""
     pairs = [(near_mean(results, better, key), near_mean(results, worse, key)) for key in ("psnr_db", "ssim")]
     gains = [ours - theirs for ours, theirs in pairs if ours is not None and theirs is not None]
     if len(gains) < 2:
@@ -70,7 +70,7 @@ def _answer(results: Sequence[Result], better: str, worse: str) -> Answer:
 
 
 def _means(results: Sequence[Result], name: str, key: str) -> dict[str, list[float]]:
-    """Return the mean of each source over the distances above 0, one for each seed."""
+    """Return the means of each source over the distances above 0; one mean per seed."""
     found: dict[str, list[float]] = {}
     for one in results:
         path = "recorded" if "bag" in one.unit.arguments else "straight"

@@ -45,7 +45,7 @@ class ColourOnlyField:
     ) -> None:
         """Create the field for a panorama (H, 2 H, 3) uint8 and its pose (4, 4)."""
         config = config or VirtualSpaceConfig()
-        # A sphere sets the scale of the lattice; surface positions are not derived from it.
+        # The sphere only sets the scale of the lattice; no surface position is derived from it.
         sphere = np.full((32, 64), FAR_M / 3, np.float32)
         prior = prepare(rgb, sphere, map_from_camera, 0.1, config.geometry, config.panorama_width)
         self._rgb, self._pose = prior.rgb, prior.map_from_camera

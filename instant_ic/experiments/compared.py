@@ -42,7 +42,7 @@ def view_units(
         sources: sources of views.
         worlds: worlds if the options name none.
         paths: paths of ``PATHS``.
-        keep_images: the first of each kind of world keeps images.
+        keep_images: keep images of the first world of each kind.
         settings: further values of ``VspaceSettings``.
     """
     common: dict[str, Any] = {
@@ -76,7 +76,7 @@ def view_units(
 
 
 def _seed_of(world: str, start_seed: int) -> int:
-    """Return the seed in a world's name, or that of its start."""
+    """Return the seed in a world's name, or the seed of its start."""
     own = world.partition(":")[2]
     return int(own) if own.isdigit() else start_seed
 

@@ -74,7 +74,7 @@ class Scored:
         rgb: image, (H, W, 3) uint8.
         depth_m: result in metres (the model's unit if it was not scaled), (h, w) float32; 0 is unknown.
         truth_m: true depth, (H', W') float32; 0 is unknown; None without ground truth.
-        before: metrics of the network's metres before scaling; None if it estimates none, or without ground truth.
+        before: metrics of the network's metres before scaling; None if its depth is relative, or without ground truth.
         after: metrics of the result; None without ground truth.
         within_sigma: share of pixels with an error within one sigma; None without LiDAR or truth.
         seconds: wall time of network, scaling and fusion.
@@ -113,7 +113,7 @@ class Evaluator:
         completion: network of source ``completed``.
 
     Raises:
-        DepthEvaluationError: the settings need a model, or a different one.
+        DepthEvaluationError: the model is missing, or does not fit the settings.
     """
 
     def __init__(self, settings: DepthSettings, model: DepthModel | None, completion: DepthModel | None = None) -> None:
@@ -143,7 +143,8 @@ class Evaluator:
             truth_m: true radial depth in metres, (H', 2 H'); 0 is unknown; None: no comparison.
 
         Raises:
-            DepthEvaluationError: not a panorama, nothing to compare, or LiDAR without ground truth to measure.
+            DepthEvaluationError: the image is not a panorama, no pixel can be compared, or the simulated LiDAR has no
+                ground truth to measure.
         """
         _check_panorama(name, "image", rgb)
         truth = None if truth_m is None else _known_depth(name, truth_m)
@@ -249,7 +250,7 @@ def pair(images: Sequence[Path], truths: Sequence[Path]) -> list[tuple[Path, Pat
     """Pair images and depth files in their order, or each image with None.
 
     Raises:
-        DepthEvaluationError: their numbers differ, or the stems of a pair (beside ``_rgb`` and ``_depth``).
+        DepthEvaluationError: the numbers of files differ, or the stems of a pair (apart from ``_rgb`` and ``_depth``).
     """
     if not truths:
         return [(image, None) for image in images]

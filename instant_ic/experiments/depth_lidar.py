@@ -58,7 +58,7 @@ def measure(
     """Simulate one revolution of a VLP-16 on the camera's vertical, from a level depth image.
 
     LiDAR and camera share a vertical axis, so each beam stays in one column of the image. It ends at the nearest pixel
-    of its column that lies on its ring, within the height of a pixel. What the camera does not see gives no points.
+    of its column that lies on its ring, within the height of a pixel. Hidden surfaces give no points.
 
     Args:
         depth_m: radial depth of a level panorama in metres, (H, W); 0 or not finite is unknown.
@@ -99,7 +99,7 @@ def measure_world(
     errors: RangeErrors | None = None,
     through_glass: bool = False,
 ) -> NDArray[np.float32]:
-    """Simulate one revolution of a VLP-16 by ray casting, also behind visible surfaces.
+    """Simulate one revolution of a VLP-16 by ray casting; it also hits surfaces that the camera does not see.
 
     Args:
         renderer: renderer of the world.
@@ -107,7 +107,7 @@ def measure_world(
         lidar_height_m: height of the LiDAR above the floor.
         camera_height_m: height of the camera above the floor.
         errors: errors of the ranges; None: the default ones.
-        through_glass: windows (upright surfaces that shine) return no points.
+        through_glass: windows (upright surfaces that emit light) return no points.
 
     Returns:
         Points in the camera's frame in metres, (N, 3).

@@ -1,4 +1,4 @@
-"""V.F, Fig. 11: many kinds of places, and the losses of each by depth, unseen places and the pose."""
+"""V.F, Fig. 11: many kinds of places, and what each loses by unseen surfaces, wrong depth and wrong poses."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from instant_ic.vspace.config import ReadinessConfig
 
 measure = measure_views
 FIT_DB = ReadinessConfig().psnr_db
-"""PSNR from which the stack regards a virtual space as fit to show; a place below it fails."""
+"""Least PSNR at which the stack regards a virtual space as fit to show; a place with less fails."""
 LOSSES = ("depth", "unseen", "pose")
 NAMES = {
     WORLD: "corridor with side rooms",
@@ -26,7 +26,7 @@ NAMES = {
 _HARD = ("hall", "windows", "crossing")
 """Places that do not always work in the paper."""
 _LEAST_DB = 0.3
-"""A loss below this is no reason."""
+"""Smallest loss in dB that counts as a reason."""
 
 
 def units(options: Options) -> list[Unit]:
@@ -37,10 +37,10 @@ def units(options: Options) -> list[Unit]:
 
 
 def losses(one: Result, method: str) -> dict[str, float | None]:
-    """Return the losses of a place from 0.5 to 2 m in dB, by reason; None where one cannot be known.
+    """Return the losses of a place from 0.5 to 2 m in dB, by reason; None for a loss that cannot be measured.
 
-    ``unseen``: gain of the truth where the keyframe has not seen the place. ``depth``: gain of true depth beyond that.
-    ``pose``: loss by the poses of SLAM.
+    ``unseen``: gain if the truth replaces pixels that the keyframe has not seen. ``depth``: further gain by true depth.
+    ``pose``: loss by SLAM's poses.
     """
     pairs = {"depth": ("exact-fill", "fill"), "unseen": ("fill", method), "pose": (method, "slam-pose")}
     found: dict[str, float | None] = {}
@@ -72,11 +72,11 @@ def section(results: Sequence[Result], options: Options) -> Section:
     place_columns = ("world", "PSNR, dB", *lost_columns, "depth error", "SLAM error, m", "main reason")
     parts: list[Part] = [
         Text(
-            f"Mean PSNR from 0.5 to 2 m, straight and on a curve. A place fails below {FIT_DB:g} dB, the value from "
-            "which the stack regards a virtual space as fit to show. unseen: gain of the truth where the keyframe has "
-            "not seen the place. depth: gain of true depth beyond that. pose: loss by the poses of the stack's SLAM on "
-            "slipping tracks. The reason is the largest loss, or resolution where none reaches "
-            f"{_LEAST_DB:g} dB: sharpness, and looks that depend on the direction of view."
+            f"Mean PSNR from 0.5 to 2 m, straight and on a curve. A place fails below {FIT_DB:g} dB, the least at "
+            "which the stack regards a virtual space as fit to show. unseen: gain if the truth replaces pixels that "
+            "the keyframe has not seen. depth: further gain by true depth. pose: loss by the poses of the stack's SLAM "
+            f"on slipping tracks. The reason is the largest loss, or resolution if none reaches {_LEAST_DB:g} dB: "
+            "sharpness, and colours that depend on the direction of view."
         ),
         Table("Kinds of places, the worst first", kind_columns, kinds, command),
         Table("Each place, the worst first", place_columns, each, command),

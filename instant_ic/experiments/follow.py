@@ -47,8 +47,7 @@ FloatArray = NDArray[np.float64]
 
 DT_S = 0.05
 REACHED_M, REACHED_RAD = 0.20, math.radians(12.0)
-"""Largest true distance from r-bot to v-bot at the goal: the arbiter's 0.15 m and 10° (switch.*) plus the pose error.
-"""
+"""Largest true distance from r-bot to v-bot at the goal: the arbiter's 0.15 m and 10° (switch.*) plus pose errors."""
 SPARE_M = 0.05
 """A goal is reachable if the footprint with this margin on every side can get there."""
 OPERATOR_M_S = 0.4
@@ -262,7 +261,7 @@ class FollowDrive:
         self.late.append(command)
         asked = self.late.popleft()
         limits = MotionLimits()
-        if asked.action == "stop":  # the arbiter marks it as a hard stop, which the base obeys with its own ramp
+        if asked.action == "stop":  # the arbiter publishes a hard stop, which the base executes with its own ramp
             hard = LimitsConfig().hard_decel_m_s2
             turning = 2.0 * hard / SkidSteerConfig().effective_width
             limits = replace(limits, max_linear_accel_m_s2=hard, max_angular_accel_rad_s2=turning)

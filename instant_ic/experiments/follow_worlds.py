@@ -29,7 +29,7 @@ RANGE_MIN_M, RANGE_MAX_M = 0.40, 30.0
 SCAN_BAND_M = (0.10, 1.30)
 """Heights of the flat scan (config/robot.yaml)."""
 IN_THE_WAY_M = (0.05, 1.25)
-"""Height range in which an object blocks the robot: the crawler with its mast."""
+"""Height range in which an object blocks the robot, the crawler with its mast."""
 LENGTH_M, WIDTH_M = 0.60, 0.50
 WALL_M = 0.10
 STEEPEST = math.tan(math.radians(15.0))
@@ -229,7 +229,7 @@ def shortest_way(mask: OccupancyMask, start: FloatArray, goal: FloatArray, margi
         (np.stack([start[:2], goal[:2]]) - mask.origin) / step
     ).astype(int)[:, ::-1]
     turn = round(float(start[2]) / (math.pi / 8)) % 16
-    if not free[turn, start_row, start_column]:  # the robot stands there: its heading may be half a bin off
+    if not free[turn, start_row, start_column]:  # the start is free, but the bin's heading may be half a bin off
         fits = np.flatnonzero(free[:, start_row, start_column])
         if fits.size == 0:
             return None

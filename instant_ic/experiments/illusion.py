@@ -44,14 +44,14 @@ Still = dict[str, NDArray[np.uint8]]
 class Film:
     """The frames of one episode in the order of time, and whether the drive reached its goal.
 
-    ``stills`` are of the frame nearest to each multiple of ``STEP_M``, by that distance in metres.
+    ``stills`` maps each multiple of ``STEP_M``, in metres, to the images of the frame nearest to it.
     """
 
     index: int
     completed: bool = False
     frames: list[IllusionFrame] = field(default_factory=list)
     stills: dict[float, Still] = field(default_factory=dict)
-    _off_m: dict[float, float] = field(default_factory=dict)  # how far each still is from its distance
+    _off_m: dict[float, float] = field(default_factory=dict)  # difference of each still's distance from its multiple
 
     def take(self, frame: IllusionFrame, images: Still, truth: NDArray[np.uint8]) -> None:
         """Add a frame, its images by source, and the true image."""
@@ -90,7 +90,7 @@ def evaluate(
     """Film all episodes, ``jobs`` in parallel; with more than one job, each in its own process.
 
     Raises:
-        ValueError: nothing to do, no such world.
+        ValueError: there is nothing to do, or the world does not exist.
         TimeoutError: the episodes took longer than ``timeout_s``.
         RuntimeError: a process died, or a stack did not become ready.
     """
@@ -143,7 +143,7 @@ def figures(frames: Sequence[IllusionFrame], source: str) -> dict[str, Any]:
 
 
 def by_distance(frames: Sequence[IllusionFrame], source: str) -> list[dict[str, Any]]:
-    """Return ``figures`` by distance behind the near face, in rows of ``STEP_M`` around their distance."""
+    """Return ``figures`` by distance behind the near face; each row covers ``STEP_M`` around its distance."""
     rows: dict[float, list[IllusionFrame]] = {}
     for frame in frames:
         if frame.distance_m is not None:
@@ -156,7 +156,7 @@ def _row(distance_m: float) -> float:
 
 
 def save_strip(path: Path, films: Sequence[Film]) -> None:
-    """Save rows of frames by distance behind the obstacle's near face, of the episode that has most of them.
+    """Save the episode with the most stills as rows of images by distance behind the obstacle's near face.
 
     Raises:
         ValueError: no frame has a distance: no obstacle was passed.

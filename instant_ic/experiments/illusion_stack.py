@@ -41,14 +41,14 @@ WIDTH, HEIGHT, FOV_RAD = 640, 360, np.pi / 2
 TRUE_SIGMA = 0.01
 """Relative sigma of the true depth: it is sampled once per pixel."""
 ASIDE_M = 0.8
-"""Largest distance of an obstacle's centre from the v-bot's line at which it blocks the v-bot's way."""
+"""An obstacle blocks the v-bot's way if its centre is at most this far from the v-bot's line, metres."""
 
 
 @dataclass(frozen=True)
 class Passage:
-    """The v-bot's way through obstacles: the line from its position (2,) when it takes over along a unit vector (2,).
+    """The v-bot's way through obstacles: a line from its position (2,) at the takeover, along a unit vector (2,).
 
-    ``obstacles`` are those in the way, nearest first, each with the position of its near face along the line, metres.
+    ``obstacles`` are the blocking ones, nearest first, each with the position of its near face along the line, metres.
     """
 
     start: FloatArray
@@ -71,7 +71,7 @@ class Passage:
     def obstacle_at(self, place: FloatArray) -> tuple[float, Obstacle] | None:
         """Return how far a position (2,) lies behind the near face of the passed obstacle, and that obstacle.
 
-        The obstacle is the last one whose near face lies behind the position, else the first one; None without any.
+        It is the last obstacle whose near face has been passed, or else the first one; None without obstacles.
         """
         if not self.obstacles:
             return None
@@ -95,11 +95,11 @@ class IllusionFrame:
 
     Attributes:
         episode, time_s: episode and simulated seconds.
-        distance_m: position behind the near face of the obstacle that is passed, negative before it; None without any.
-        with_obstacle: the truth is the world with the obstacle.
+        distance_m: distance behind the near face of the passed obstacle, negative before it; None without obstacles.
+        with_obstacle: True if the truth is the world with the obstacle.
         scores: score of each source against that truth.
         unseen_share: share of each source's view that no keyframe has seen.
-        expected_psnr_db: estimate of the virtual space for the live view.
+        expected_psnr_db: PSNR that the virtual space estimates for the live view.
     """
 
     episode: int
@@ -208,8 +208,8 @@ class FilmedStack(SimulatedStack):
     def _truth_at(self, world_from_camera: FloatArray) -> tuple[EquirectRenderer, float | None, bool]:
         """Return the truth's renderer at a pose, the distance behind the near face, and whether it has the obstacle.
 
-        Before the near face the obstacle belongs to the image. From there on the v-bot is inside it or behind it, and
-        the truth is the world without it.
+        Before the near face, the true image shows the obstacle. From there on the v-bot is inside or behind the
+        obstacle, and the truth is the world without it.
         """
         found = None if self._passage is None else self._passage.obstacle_at(world_from_camera[:2, 3])
         if found is None:

@@ -80,7 +80,7 @@ class Unit:
 
     Attributes:
         experiment: name of its experiment.
-        arguments: JSON values on which the result depends, beside the program.
+        arguments: JSON values on which the result depends, besides the program.
     """
 
     experiment: str
@@ -118,7 +118,7 @@ def _files_of(place: str) -> list[tuple[str, int, int]]:
 
 @dataclass(frozen=True)
 class Result:
-    """Values that ``measure`` returned for a unit and the time it took; no ``data`` but an ``error`` if it failed."""
+    """Values that ``measure`` returned for a unit, and the time it took. A failed unit has an ``error`` and no data."""
 
     unit: Unit
     data: dict[str, Any]
@@ -154,9 +154,9 @@ def run(
 ) -> list[Result]:
     """Measure all units that have no result in the folder; return the results in the order of the units.
 
-    The first seeds of all experiments come first. A unit that fails, whose process dies, that takes longer than
-    ``unit_timeout_s`` or is not measured within ``timeout_s`` has a result with its error. That result is not kept:
-    the next run tries the unit again.
+    The first seeds of all experiments come first. The result of a unit is an error if it fails, its process dies, it
+    takes longer than ``unit_timeout_s``, or it is not measured within ``timeout_s``. Errors are not kept, so that the
+    next run tries the unit again.
     """
     folder.mkdir(parents=True, exist_ok=True)
     found = {result.unit.key: result for result in kept(units, folder)}
@@ -171,13 +171,13 @@ def run(
             found[result.unit.key] = result
             on_result(result)
     except TimeoutError:
-        missing = f"not measured: the time limit of {timeout_s:.0f} s was over"
+        missing = f"not measured: the time limit of {timeout_s:.0f} s has passed"
         found = {unit.key: Result(unit, {}, 0.0, 0.0, missing) for unit in units} | found
     return [found[unit.key] for unit in units]
 
 
 def machine() -> dict[str, str]:
-    """Return CPU, operating system, and versions of what the figures depend on."""
+    """Return CPU, operating system, and versions of the software on which the figures depend."""
     info = Path("/proc/cpuinfo")
     lines = info.read_text().splitlines() if info.is_file() else []
     names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]

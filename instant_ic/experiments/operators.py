@@ -26,7 +26,7 @@ def units(options: Options) -> list[Unit]:
         ValueError: a recording was given.
     """
     if options.bag is not None:
-        raise ValueError("operators: --bag: a recorded robot does not react to another operator. Leave out --bag")
+        raise ValueError("operators: a recorded robot does not react to another operator. Leave out --bag")
     return [
         Unit("operators", {"world": world, "seed": seed, "method": method})
         for world in options.worlds or (RANDOM_CORRIDORS,)
@@ -77,9 +77,9 @@ def section(results: Sequence[Result], options: Options) -> Section:
     )  # fmt: skip
     parts: list[Part] = [
         Text(
-            "A simulated operator; nothing is claimed about people. mesh is conventional IC with a tripod scan made "
-            "without the obstacles. PSNR: the two images on either side of a switch into the virtual space and back. "
-            "Poses are those of the stack's own SLAM."
+            "The operator is simulated; nothing is claimed about people. mesh is conventional IC with a tripod scan "
+            "made without the obstacles. PSNR compares the images before and after each switch into the virtual space "
+            "and back. Poses are those of the stack's own SLAM."
         ),
         Table("Drives", columns, lines, command_of(options, "operators")),
     ]

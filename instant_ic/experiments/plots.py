@@ -67,8 +67,8 @@ def save_map(
     """Save a map with the robot's pose (x, y, yaw) and named paths (N, ≥2)."""
     figure, axes = new_figure(1, 1, (7.0, 7.0))
     axis = axes[0, 0]
-    # Three tones by the sign of the evidence, shaded slightly by its strength: a standing robot provides weak evidence
-    # everywhere, which a linear scale would show as grey on grey.
+    # Three tones show the sign of the evidence, slightly shaded by its strength. A standing robot provides only weak
+    # evidence, which a linear scale would show as grey on grey.
     values, resolution_m = grid.values, grid.resolution
     shade = np.where(values < 50, 1.0 - 0.15 * values / 50.0, 0.35 * (100 - values) / 50.0)
     shade = np.where(values < 0, 0.7, shade)
@@ -159,7 +159,7 @@ def figure_svg(figure: Any, axis: Any) -> str:
 
 
 def image_strip(columns: Sequence[str], rows: Sequence[tuple[str, Sequence[NDArray[np.uint8]]]], tile: int) -> Image:
-    """Join rows of a label and an image for each column, under the columns' names, to one RGB image.
+    """Join images to one RGB image, with the columns' names above and a label beside each row.
 
     ``tile`` is the width of an image in pixels.
     """

@@ -46,19 +46,19 @@ def run_all(
         jobs: number of processes; one, without ``call_timeout_s``: this process.
         prepare: called first in each process.
         timeout_s: time limit for all calls.
-        call_timeout_s: time limit for one call, whose process is then killed. With it the result of a lost call is its
-            error.
+        call_timeout_s: time limit for one call, whose process is then killed. With this limit, a lost call yields its
+            error as its result.
 
     Raises:
         ValueError: ``jobs`` is less than 1.
         TimeoutError: the calls took longer than ``timeout_s``.
-        LostError: a process died, without ``call_timeout_s``.
+        LostError: a process died, and ``call_timeout_s`` is None.
     """
     if jobs < 1:
         raise ValueError(f"jobs must be at least 1 (got {jobs})")
     deadline, late = (
         time.monotonic() + timeout_s,
-        f"it took longer than {timeout_s:.0f} s; {{}} of {len(tasks)} are done",
+        f"the time limit of {timeout_s:.0f} s has passed; {{}} of {len(tasks)} are done",
     )
     if call_timeout_s is None and (jobs == 1 or len(tasks) <= 1):
         if tasks:
@@ -137,7 +137,7 @@ class _Worker(threading.Thread):
 
 
 def _prepare(prepare: Callable[[], None], parent: int) -> None:
-    """Prepare a process; it ignores Ctrl-C, which also reaches its parent, and ends when its parent is gone."""
+    """Prepare a process: it ignores Ctrl-C, which its parent handles, and ends when its parent is gone."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_end_with_parent, args=(parent,), daemon=True).start()
     prepare()

@@ -35,15 +35,15 @@ def units(options: Options) -> list[Unit]:
 
 
 def section(results: Sequence[Result], options: Options) -> Section:
-    """Return curves, tables, and the distance up to which ours is above each scan."""
+    """Return curves, tables, and the distance up to which ours is better than each scan."""
     command = command_of(options, "reconstruction")
     parts: list[Part] = [
         Text(
             "One panorama at the start. Conventional IC shows a mesh that was scanned before: by stations with range "
             "noise, registration errors and another exposure and white balance, meshed in a grid. Its colours are "
-            "fitted to the panorama by one factor a channel. mesh is a perfect scan, the upper bound. The paper, "
-            "with a tripod scanner: instant IC is above in SSIM for about 2 m straight and for 1 to 2 m on the curve. "
-            "Views are seen from true poses."
+            "fitted to the panorama by one factor per channel. mesh is a perfect scan, the upper bound. In the paper, "
+            "with a tripod scanner, instant IC has the higher SSIM for about 2 m straight and for 1 to 2 m on the "
+            "curve. Views are rendered at true poses."
         ),
     ]
     for name in dict.fromkeys(family(one) for one in results if one.data):
@@ -70,7 +70,7 @@ def section(results: Sequence[Result], options: Options) -> Section:
 
 
 def _above(results: Sequence[Result], name: str, path: str, key: str, ours: str, scan: str) -> list[float]:
-    """Return the distance up to which ours is above a scan without a break, one for each seed."""
+    """Return the distance up to which ours is better than a scan without a break, one for each seed."""
     found = []
     for one in results:
         values = series([one], name, path, key)

@@ -29,7 +29,7 @@ def opened(bag: Path, kinds: Mapping[str, str], remedy: str = "", optional: str 
         optional: topic that may be missing.
 
     Raises:
-        ValueError: not a bag, a damaged one, or a topic is missing or has another type; names it.
+        ValueError: the path is not a bag, the bag is damaged, or a topic is missing or has another type.
     """
     try:
         with BagReader(bag) as reader:
@@ -50,10 +50,10 @@ def count_keyframes(bag: Path) -> int:
 
 
 def read_keyframes(bag: Path) -> list[Shot]:
-    """Read the keyframes of a bag whose depth can be trusted, oldest first; their own depth stands for the true one.
+    """Read the keyframes of a bag whose depth can be trusted, oldest first; their depth serves as the true depth.
 
     Raises:
-        ValueError: no bag, fewer than two such keyframes, or one that cannot be decoded.
+        ValueError: the path is not a bag, it has fewer than two such keyframes, or one cannot be decoded.
     """
     from instant_ic.adapters.nerf import decode_keyframe
     from instant_ic.depth.sources import DepthResult

@@ -23,7 +23,7 @@ STATE, MAP, CAMERA, KEYFRAME = "/ic/state", "/map", "/camera/image/compressed", 
 TYPES = {STATE: "ControlState", MAP: "OccupancyGrid", CAMERA: "CompressedImage", KEYFRAME: "Keyframe"}
 SIZE = (320, 180)
 _BESIDE_S = 1.0
-"""The first and the last still are this long before and after the virtual space."""
+"""Time from the first still to the virtual space, and from the virtual space to the last still, seconds."""
 
 
 @dataclass(frozen=True)
@@ -40,8 +40,8 @@ class RecordedDrive:
     """A drive from a bag.
 
     Attributes:
-        drive: figures, as of a simulated one; the r-bot's pose is the stack's estimate.
-        moments: stills of ``still_times``.
+        drive: figures as for a simulated drive, but with the stack's estimate as the r-bot's pose.
+        moments: stills at ``still_times``.
         plot, modes: PNG of both trajectories on the map, and of the arbiter's mode over time.
     """
 
@@ -55,7 +55,7 @@ def read_drive(bag: Path) -> RecordedDrive:
     """Read a drive. Views of the virtual space are rendered again from the keyframes.
 
     Raises:
-        ValueError: no bag, or a topic is missing; names it.
+        ValueError: the path is not a bag, or a topic is missing.
     """
     from instant_ic.msg import deserialize
 
@@ -89,9 +89,9 @@ def read_drive(bag: Path) -> RecordedDrive:
 
 
 def as_log(states: Sequence[tuple[float, Any]], keyframes: int = 0) -> DriveLog:
-    """Resample states (seconds, ControlState), which come at uneven times, in the steps of a log.
+    """Resample states (seconds, ControlState), which come at uneven times, to the steps of a log.
 
-    Poses are interpolated, as their differences are speeds; all else is held until the next state.
+    Poses are interpolated because speeds are computed from their differences. Other values hold until the next state.
     """
     from instant_ic.msg import pose2_from_message, twist_values
 
@@ -123,7 +123,7 @@ def as_log(states: Sequence[tuple[float, Any]], keyframes: int = 0) -> DriveLog:
 def still_times(log: DriveLog) -> list[float]:
     """Return times as in Fig. 9: before, first, middle and last in the virtual space, and after it.
 
-    They are of the first passage; without one, the drive's first time.
+    They belong to the first passage. Without a passage, only the drive's first time is returned.
     """
     times, virtual = np.array(log.time_s), np.array(log.virtual)
     if not virtual.any():
@@ -164,7 +164,7 @@ def _moments(
                 base_from_camera = np.eye(4)
                 base_from_camera[2, 3] = pose[2, 3]
                 ahead = np.linalg.inv(pose_matrix(robot[0], robot[1], yaw=robot[2])) @ pose
-                if math.hypot(ahead[0, 3], ahead[1, 3]) < 0.5:  # else the keyframe is older than this drive's motion
+                if math.hypot(ahead[0, 3], ahead[1, 3]) < 0.5:  # a keyframe farther away is older than this drive
                     base_from_camera[:2, 3] = ahead[:2, 3]
                 depth = np.asarray(image_array(message.depth), np.float32)
                 rgb = decode_rgb(np.asarray(message.panorama.data, np.uint8))

@@ -66,7 +66,7 @@ class Answer:
     Attributes:
         held: True if the claim holds here; None if it was not measured.
         figures: figures that decide it.
-        units: number of measurements behind it; the report decides nothing from less than ``LEAST_UNITS``.
+        units: number of measurements behind it; the report decides nothing from fewer than ``LEAST_UNITS``.
     """
 
     held: bool | None
@@ -99,7 +99,7 @@ def spread(values: Sequence[float | None], digits: int = 2) -> str:
 
 
 def image_address(jpeg_or_other: bytes, kind: str = "image/jpeg") -> str:
-    """Return the bytes of an image as an address for a page."""
+    """Return an image as a ``data:`` address for a page."""
     return f"data:{kind};base64,{base64.b64encode(jpeg_or_other).decode()}"
 
 

@@ -1,8 +1,8 @@
-"""A place as a 3D scanner brings it home: the mesh of conventional illusory control (paper, V.A).
+"""A simulated 3D scan of a place: the mesh of conventional illusory control (paper, V.A).
 
-Stations measure ranges and take panoramas in a world that was older then. Their scans are registered with errors, fused
-in a grid of signed distances (Curless and Levoy 1996) and meshed by marching cubes. Each triangle gets its colours from
-the station that sees it best. The result is a GLB file for ``space.source: mesh``.
+Stations measure ranges and take panoramas in the world as it was at the time of the scan. The scans are registered with
+errors, fused in a grid of signed distances (Curless and Levoy 1996) and meshed by marching cubes. Each triangle gets
+its colours from the station that sees it best. The result is a GLB file for ``space.source: mesh``.
 """
 
 from __future__ import annotations
@@ -47,12 +47,13 @@ class ScanQuality:
     Attributes:
         noise_m: standard deviation of a range.
         registration_m: standard deviation of a station's position on each axis.
-        registration_deg: standard deviation of its heading; of roll and pitch a quarter.
+        registration_deg: standard deviation of its heading; a quarter of it for roll and pitch.
         cell_m: edge of the grid's cells and about that of the triangles; thinner objects are lost.
         spacing_m: distance between stations.
-        width: of the stations' panoramas, pixels.
-        colour: standard deviation of the logarithm of the white balance; twice of the exposure, half of each texture.
-        older: share of the free-standing objects that stood elsewhere.
+        width: width of the stations' panoramas, pixels.
+        colour: standard deviation of the logarithm of the white balance; twice it for the exposure, half it for each
+            texture.
+        older: share of the free-standing objects that stood elsewhere at the time of the scan.
     """
 
     noise_m: float = 0.004
@@ -70,9 +71,9 @@ class Station:
     """One position of the scanner.
 
     Attributes:
-        pose: (4, 4), map_from_station, as registered.
-        range_m: (H, 2 H) as measured; 0 without a return.
-        rgb: (2 H, 4 H, 3) as taken, or of the ranges' size.
+        pose: map_from_station as registered, (4, 4).
+        range_m: measured ranges, (H, 2 H); 0 without a return.
+        rgb: panorama, (2 H, 4 H, 3), or (H, 2 H, 3) like the ranges.
     """
 
     pose: NDArray[np.float64]
@@ -89,7 +90,7 @@ class Station:
 
 
 def aged(world: World, quality: ScanQuality, rng: np.random.Generator) -> World:
-    """Return the world at the time of its scan: other light and colours, objects elsewhere."""
+    """Return the world at the time of its scan: with other light and colours, and some objects elsewhere."""
     drift = np.exp(rng.normal(0, 0.5 * quality.colour, (int(world.texture.max()) + 1, 3)))[world.texture]
     light = np.exp(rng.normal(0, quality.colour, 3) + rng.normal(0, 2 * quality.colour))
     tint, emission = world.tint * drift * light, world.emission * np.float32(light.mean())
@@ -134,7 +135,7 @@ def take_station(world: World, place: Floats, quality: ScanQuality, rng: np.rand
     _, face = renderer.cast(true[:3, 3], directions.reshape(-1, 3) @ true[:3, :3].T.astype(np.float32))
     surface = world.face_surface[np.maximum(face, 0)]
     sine = np.abs(np.einsum("ij,ij->i", world.normal[surface], directions.reshape(-1, 3) @ true[:3, :3].T))
-    # Glass gives no return; what shines and is upright is a window.
+    # Glass gives no return. Upright surfaces that emit light are windows.
     glass = (world.emission[surface] > 0) & (np.abs(world.normal[surface, 2]) < 0.5)
     lost = (face < 0) | (sine < _GRAZING) | glass
     range_m = range_m + rng.normal(0, quality.noise_m, range_m.shape).astype(np.float32)
@@ -214,11 +215,11 @@ def scan_world(
     """Scan a world around a start and write the mesh as a GLB file.
 
     Args:
-        world: as it is when it is scanned, before ``quality.older`` and ``quality.colour`` change it.
+        world: world to scan; ``quality.older`` and ``quality.colour`` change a copy of it first.
         start: (x, y, ...) of the drive, on the free floor.
-        quality: of the scan.
-        seed: of all errors.
-        path: the file.
+        quality: errors of the scan.
+        seed: seed of all errors.
+        path: GLB file to write.
         origin: (x, y, yaw) of the file's frame in the world.
 
     Returns:

@@ -27,7 +27,7 @@ from instant_ic.slam.scan import FloatArray
 from instant_ic.slam.start import warm_up
 
 MATCH_S = 0.006
-"""Largest difference of two times, in seconds, that count as the same."""
+"""Two times that differ by at most this many seconds count as the same."""
 
 
 @dataclass(frozen=True)
@@ -262,7 +262,7 @@ def evaluate_log(
     """Run SLAM on a log and evaluate it; return figures for JSON, and the run itself.
 
     Figures of the final trajectory have plain names; ``online_translation_mean_m`` and ``online_rotation_mean_deg``
-    refer to the poses published online. Arguments as of ``run_log``.
+    refer to the poses published online. The other arguments are those of ``run_log``.
     """
     entries = list(entries)
     result = run_log(entries, config, use_wheel_odom=use_wheel_odom, on_scan=on_scan)

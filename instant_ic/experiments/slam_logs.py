@@ -71,7 +71,7 @@ class _Lines(io.TextIOWrapper):
 
 
 def refuse(error: LogError, bad: list[str] | None) -> None:
-    """Add the error of a line that is left out to ``bad``, or raise it if that is None."""
+    """Add the error of an ignored line to ``bad``, or raise it if ``bad`` is None."""
     if bad is None:
         raise error
     bad.append(str(error))
@@ -96,7 +96,7 @@ def read_log(path: str | Path, bad: list[str] | None = None) -> Iterator[LogEntr
         LogError: a line cannot be read, or the log has no scan.
         OSError: the file does not exist.
     """
-    with open_log(path, []) as lines:  # what is damaged is reported when it is read
+    with open_log(path, []) as lines:  # the reader called below reports damaged lines
         first = next((line for line in lines if line.strip() and not line.startswith("#")), "")
     fields = first.split()
     mines = len(fields) > _MINES_FIRST_RANGE and fields[0].lstrip("-").isdigit()
@@ -131,7 +131,7 @@ def read_carmen(path: str | Path, bad: list[str] | None = None) -> Iterator[LogE
     skipped. The laser's mounting pose is the difference between the two poses of a line, if it is the same on all
     lines. Otherwise the first pose is a corrected one, and the laser is assumed to be mounted at the robot's centre.
     The odometry is the second pose, the first if the second never changes, or none if neither changes. FLASER readings
-    mean "no return" from the log's own ``PARAM`` on, or from the value at which readings pile up, or from 80 m on.
+    mean "no return" at or above a limit: the log's own ``PARAM``, the value at which readings pile up, or 80 m.
     Arguments and errors are those of `read_log`.
     """
     survey = _survey(path)
@@ -153,7 +153,7 @@ def read_carmen(path: str | Path, bad: list[str] | None = None) -> Iterator[LogE
 
 
 def _nothing(error: LogError, bad: list[str] | None) -> LogError:
-    """Return the error of a log without a scan: that of its first bad line, if it has any."""
+    """Return the error of a log without a scan: its first bad line's error, if it has a bad line."""
     return LogError(f"{bad[0]} (and no line can be read)") if bad else error
 
 
@@ -232,7 +232,7 @@ def _count(text: str, what: str) -> int:
 
 
 _MOST_STAMP_S = 9_000_000_000
-"""In nanoseconds it still is a 64-bit number."""
+"""Largest stamp; in nanoseconds it still fits into 64 bits."""
 
 
 def _stamp_ns(text: str) -> int:
@@ -310,7 +310,7 @@ def read_mines(path: str | Path, bad: list[str] | None = None) -> Iterator[LogEn
     """Read the scans of a BreezySLAM `exp*.dat` recording (MinesRover: wheel ticks and a Hokuyo URG-04LX).
 
     Columns: 0 is the time in µs, 2 and 3 the left and right ticks, from 24 on 682 ranges in mm over 240°, right to
-    left. The outer 70 on each side are unusable. 0 and the sensor's small error codes are erroneous (NaN). The odometry
+    left. The outer 70 on each side are unusable. 0 and the sensor's small error codes become NaN. The odometry
     is integrated from the ticks with differential drive kinematics and starts at the origin. Arguments and errors are
     those of `read_log`.
     """

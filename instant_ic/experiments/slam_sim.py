@@ -36,7 +36,7 @@ ROUTE = ((0.0, 0.0), (3.0, 0.7), (5.0, 0.7), (10.8, 0.0), (10.8, 8.5), (10.8, 0.
 
 @dataclass(frozen=True)
 class RoundTrip:
-    """A drive in the simulator: scans with odometry, true poses (n, 3) in the frame of the first, metres driven."""
+    """A drive in the simulator: scans with odometry, true poses (n, 3) in the frame of the first pose, and metres."""
 
     entries: list[LogEntry]
     truth: FloatArray

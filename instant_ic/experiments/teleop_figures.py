@@ -21,7 +21,7 @@ STEP_S = 0.05
 TRACK_S = 0.2
 """Seconds between two points of a track."""
 LATENCY_S = 0.35
-"""Latency allowed in obedience: a robot obeys if it follows any command of this period (and its ramps since)."""
+"""Latency allowed in obedience: a robot obeys if it follows any command of this period, with its ramps since then."""
 TOLERANCE_M_S, TOLERANCE_RAD_S = 0.05, 0.15
 """Tolerance of the speed: tracks slip, and speed is measured over 0.1 s."""
 FLICKER_S = 2.0
@@ -83,11 +83,11 @@ class Switch:
     Attributes:
         time_s: time of the switch.
         to_virtual: True into the virtual space, False back.
-        position_error_m: between the positions of the last image before and the first after, as the stack knows them,
-            minus the distance that the shown robot drove between the arrivals of the two images.
-        yaw_error_deg: between the headings of v-bot and r-bot just before the switch, as the stack knows them; the page
-            rotates the images to these headings.
-        psnr_db: between the two images; None if they were not rendered.
+        position_error_m: distance between the positions of the last image before the switch and the first after it, as
+            the stack knows them, minus the distance that the shown robot drove between the arrivals of the two images.
+        yaw_error_deg: angle between the headings of v-bot and r-bot just before the switch, as the stack knows them;
+            the page rotates the images to these headings.
+        psnr_db: PSNR between the two images; None if they were not rendered.
     """
 
     time_s: float
@@ -106,7 +106,7 @@ class TeleopDrive:
     completed: bool = False
     gave_up: bool = False
     seconds: float = 0.0
-    """From the first command until the r-bot is at the goal, or the end of the drive."""
+    """Time from the first command until the r-bot is at the goal or the drive ends."""
     way_m: float = 0.0
     driven_m: float = 0.0
     contacts: int = 0
@@ -229,9 +229,10 @@ def pictures_at(pictures: list[Shown], time_s: float, to_virtual: bool) -> tuple
 
 
 def picture_error_m(before: Shown, after: Shown, log: DriveLog) -> float:
-    """Return how far two images that should coincide are apart, as the stack knows it.
+    """Return the distance between the places of two images that should coincide, as the stack knows them.
 
-    The shown robot moves between the arrivals of the two images; its mean speed around the switch gives that distance.
+    The shown robot moves between the arrivals of the two images. This motion is subtracted; the mean speed around the
+    switch gives its length.
     """
     speeds = shown_speeds(log)[:, 0]
     times = np.array(log.time_s)
@@ -251,7 +252,7 @@ def obstacles_met(log: DriveLog, centres: FloatArray) -> int:
 
 
 def judge(drive: TeleopDrive, log: DriveLog, centres: FloatArray) -> None:
-    """Fill in the figures that follow from the log; image figures of the switches are set elsewhere."""
+    """Fill in the figures that follow from the log; the caller sets the image figures of the switches."""
     drive.obedience = obedience(log)
     drive.switches = find_switches(log)
     drive.flicker = count_flicker(drive.switches)

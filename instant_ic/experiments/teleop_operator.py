@@ -30,7 +30,7 @@ class OperatorConfig:
         backs_off_s, backs_off_m_s: time and speed of driving back before a detour.
         passed_m: distance from the blocked place at which a detour ends, metres.
         gives_up_after: number of detours at one place.
-        spare_m: margin on every side of a detour, metres; the second if the first does not fit.
+        spare_m: margin on every side of a detour, metres; the second is used if the first does not fit.
     """
 
     cruise_m_s: float = 0.4
@@ -49,10 +49,10 @@ class Sight:
     """The operator's knowledge at one moment.
 
     Attributes:
-        time_s: simulated.
+        time_s: simulated time.
         pose: (3,) of the shown robot in the world's frame; the position is as old as the image.
-        virtual: the rendered view is shown.
-        stopped: the robot is stopped until the controls are released.
+        virtual: True while the rendered view is shown.
+        stopped: True while the robot is stopped until the controls are released.
         speed: (m/s, rad/s) of the shown robot.
         robot: (3,) true pose of the r-bot, for planning a detour while the operator looks at it.
     """
@@ -68,9 +68,9 @@ class Sight:
 class ScriptedOperator:
     """Turns towards the next goal and drives at it, through all obstacles.
 
-    Blocked for ``notices_s`` in the real view, the operator looks around with full knowledge: backs off, drives around
-    along the shortest path with ``spare_m``, and looks at goals again after ``passed_m``. In the virtual space the
-    operator drives on.
+    If the robot is blocked for ``notices_s`` in the real view, the operator looks around with full knowledge, backs off
+    and drives around the obstacle on the shortest path with ``spare_m``. After ``passed_m`` the operator again looks at
+    goals only. In the virtual space the operator just drives on.
 
     Args:
         goals: (N, 2) positions in the world's frame.

@@ -85,7 +85,7 @@ class StackConfig:
         camera_hz: images per second.
         camera_latency_s: delay from the exposure to the page, as for the simulated camera.
         depth_latency_s: delay from the exposure to the keyframe.
-        command_latency_s: least and largest delay from the arbiter to the base; each stack has one value.
+        command_latency_s: least and largest delay from the arbiter to the base; each stack draws one value.
         overrides: further parameters ``node.key:=value``; the images for depth and virtual space have the size of
             ``theta_camera.theta``.
     """
@@ -145,7 +145,7 @@ class _Page(PageServer):
         return self._stack.bus.clock.now_ns() / 1e6
 
     def publish(self, kind: str, message: dict[str, Any]) -> None:
-        """Keep the newest state; switch to the other kind of image where it says so."""
+        """Keep the newest state; switch to the other kind of image if the state says so."""
         if kind != "state":
             return
         self.state = message
@@ -293,12 +293,12 @@ class SimulatedStack(Closing):
         self.bus.publish(topic, message)
 
     def _leads_to_keyframe(self) -> bool:
-        """Return whether depth would make a keyframe of an image taken now: there is none near this position."""
+        """Return whether depth would make a keyframe of an image taken now, because none is near this position."""
         if self.time_s < self._next_depth_s - 1e-9:
             return False
         now_ns = START_NS + round(self.time_s * 1e9)
         wait_ns = (self.config.depth_latency_s + _OVERDUE_S) * 1e9
-        while self._drawn and now_ns - next(iter(self._drawn)) > wait_ns:  # not used
+        while self._drawn and now_ns - next(iter(self._drawn)) > wait_ns:  # it did not become a keyframe
             del self._drawn[next(iter(self._drawn))]
         selector = self.nodes["depth_scaler"].chain.selector
         distance_m, angle_rad = selector.config.distance_m + 0.01, math.radians(selector.config.angle_deg + 0.5)

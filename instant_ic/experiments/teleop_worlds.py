@@ -40,7 +40,7 @@ class Course:
         world: world of the simulated devices; the robot starts at its ``spawn``.
         goals: (N, 2) positions to visit in order, in the world's frame.
         obstacles: objects on the operator's path.
-        way_m: metres from the start over the goals.
+        way_m: length of the straight lines from the start over the goals, metres.
     """
 
     world: World

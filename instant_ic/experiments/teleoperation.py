@@ -108,12 +108,12 @@ def section(results: Sequence[Result], options: Options) -> Section:
         text = (
             "A recorded drive. The images around the first passage through the virtual space are the camera's, and "
             "views that are rendered again from the recorded keyframes at the v-bot's poses. Poses are those of the "
-            "robot's SLAM; what is compared with a truth, contacts included, cannot be known."
+            "robot's SLAM. Figures that need a ground truth are unknown, contacts included."
         )
     parts: list[Part] = [Text(text)]
     for one in results:
         images = one.data.get("images", {})
-        # The command stands under the last still and the plot.
+        # Only the last still and the plot show the command below them.
         parts += [Figure(name, images[name], "" if name[0] in "1234" else command) for name in images]
     done = [one for one in results if one.data]
     lines: list[list[Any]] = [

@@ -22,7 +22,7 @@ _TIMES_S, _QUICK_S = (0.25, 0.5, 1.0, 2.0, 4.0, 8.0), (0.2, 0.5)
 CLAIM_S = 4.0
 """Time within which the paper's view has converged."""
 _SETTLED_DB = 0.5
-"""Largest later gain of a view that has converged."""
+"""Largest gain of a converged view after ``CLAIM_S``, dB."""
 
 
 def units(options: Options) -> list[Unit]:
@@ -59,7 +59,7 @@ def section(results: Sequence[Result], options: Options) -> Section:
     parts: list[Part] = [
         Text(
             "Seconds are CPU seconds of one process, or of the GPU's host where there is one. ours is what the "
-            "operator sees: the panorama warped by its depth from the first moment on, the field where it is better."
+            "operator sees: the panorama warped by its depth from the start, and the field wherever it is better."
         )
     ]
     gpu = any(one.data.get("gpu") for one in results)

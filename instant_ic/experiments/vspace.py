@@ -229,7 +229,7 @@ def slam_errors(world: World, poses: Sequence[Pose], settings: VspaceSettings) -
         return None
     try:
         trip = round_trip(world, seed=settings.seed, rounds=1, route=places)
-    except ValueError:  # it touches something
+    except ValueError:  # the robot touches something
         return None
     estimates = run_log(trip.entries).online[:, 1:]
     begin = np.array([*places[0], math.atan2(places[1][1] - places[0][1], places[1][0] - places[0][0])])

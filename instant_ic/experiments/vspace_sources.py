@@ -106,7 +106,7 @@ class Shot:
 
 @dataclass(frozen=True)
 class Place:
-    """A world with its renderer, and the world before the obstacle came, when it was scanned."""
+    """A world with its renderer, and the world at the time of its scan, before the obstacle came."""
 
     world: World
     before: World
@@ -232,7 +232,7 @@ def train(space: Any, cpu_seconds: float) -> None:
 
 
 def field_alone(config: VirtualSpaceConfig) -> VirtualSpaceConfig:
-    """Return the configuration changed so that the field is shown however little it is trained."""
+    """Return the configuration changed so that the field is always shown, even if it is hardly trained."""
     return replace(config, source="field", view=replace(config.view, field_alone=True))
 
 

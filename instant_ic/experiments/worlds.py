@@ -28,7 +28,7 @@ KINDS = {
 GENERATED = ("corridor", "corridor-free", "random", "long", *KINDS)
 """Worlds that have seeds."""
 OBJECT_M, WALL_M = (0.03, 1.6), (1.9, 2.2)
-"""Heights in which an object has surfaces, and in which only walls have."""
+"""Height range in which an object has surfaces, and height range in which only walls have surfaces."""
 _CELL_M = 0.05
 _AWAY_M = 1000.0
 """Depth below the floor to which removed objects are moved."""
@@ -95,8 +95,8 @@ class Obstacle:
 def things(world: World) -> tuple[NDArray[np.int32], OccupancyMask, NDArray[np.int32]]:
     """Find the free-standing objects of a world.
 
-    An object is what is connected in the floor plan of ``OBJECT_M`` without the walls. Its surfaces lie in its cells
-    completely, above the floor and below ``OBJECT_M``. Posters and skirting boards lie on a wall and are no objects.
+    An object is a connected region of the floor plan of ``OBJECT_M`` without the walls. Its surfaces lie completely in
+    its cells, above the floor and below ``WALL_M``. Posters and skirting boards are on a wall and are no objects.
 
     Returns:
         Number of the object of each surface, (S,), 0 for none; the floor plan; the number of the object of each cell.

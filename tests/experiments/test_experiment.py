@@ -177,7 +177,7 @@ def test_finished_units_are_kept_and_failed_ones_tried_again(tmp_path, monkeypat
     assert calls == [1, 2, 2, 1]
     late = lab.run([Unit("reconstruction", {"n": n}) for n in (2, 3)], tmp_path, 1, timeout_s=-1.0)
     assert calls == [1, 2, 2, 1]
-    assert [one.error for one in late] == ["", "not measured: the time limit of -1 s was over"]
+    assert [one.error for one in late] == ["", "not measured: the time limit of -1 s has passed"]
 
 
 def test_results_of_another_program_or_another_file_are_not_used(tmp_path, monkeypatch) -> None:

@@ -47,7 +47,7 @@ class StudyPages:
         return app
 
     def close(self) -> None:
-        """End a running drive; it is driven again the next time."""
+        """End a running drive; the participant repeats it the next time."""
         if self._trial is not None:
             self._trial.end(END_S)
 
@@ -89,7 +89,7 @@ class StudyPages:
 
     async def _take(self, request: web.Request) -> web.StreamResponse:
         given = dict(await request.post())
-        if given.get("step") == str(self._number + 1):  # else from an old page: the present page is shown
+        if given.get("step") == str(self._number + 1):  # the form of an old page only leads to the present page
             if self._number == len(self.participant.order):
                 if fault := self._answer(given):
                     return self._page("", fault)

@@ -1,4 +1,4 @@
-"""The plan of a user study, the balanced order of its conditions, and what is kept of a participant."""
+"""The plan of a user study, the balanced order of its conditions, and the record of a participant."""
 
 from __future__ import annotations
 

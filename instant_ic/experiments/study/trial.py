@@ -28,7 +28,7 @@ log = logging.getLogger("instant_ic.study")
 
 
 def make_scan(folder: Path, world: str, seed: int) -> Path:
-    """Return the scan of a world without its obstacles, for the condition ``mesh``; scan the world if it is missing.
+    """Return the scan of a world without its obstacles, for the condition ``mesh``; scan the world if necessary.
 
     Raises:
         StudyError: there is no such world, or it has no course straight ahead.
