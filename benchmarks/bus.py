@@ -30,7 +30,7 @@ SIZES = {"b100": 100, "k20": 20_000, "k200": 200_000, "m1": 1_200_000, "m5": 5_5
 PERIOD_S = {"b100": 0.01, "k20": 0.01, "k200": 0.02, "m1": 0.035, "m5": 0.07}
 FANOUT = 4
 QUIET_S = 0.5
-"""No more messages are expected after this time without one."""
+"""Seconds without a message after which no more messages are expected."""
 NAMES = {
     "ours": "Instant IC, bytes",
     "image": "Instant IC, Image to array",
@@ -84,7 +84,7 @@ class PeerPair:
     subs: list[BusPeer]
 
     def send(self, topic: str, count: int, period_s: float) -> list[Receiver]:
-        """Send frames, wait until all have arrived, and return what each reader got."""
+        """Send frames, wait until all have arrived, and return each reader's receiver."""
         self.pub.ask((topic, count, period_s))
         quiet_s, before = time.monotonic() + QUIET_S, 0
         while time.monotonic() < quiet_s:
@@ -100,13 +100,13 @@ class PeerPair:
         """Wait until every reader receives from the publisher.
 
         Raises:
-            RuntimeError: a reader does not.
+            RuntimeError: a reader receives nothing.
         """
         heard = [False] * len(self.subs)
         deadline = time.monotonic() + 20.0
         while not all(heard):
             if time.monotonic() > deadline:
-                raise RuntimeError(f"nothing came on {topic}")
+                raise RuntimeError(f"no frame arrived on {topic}")
             got = self.send(topic, 5, 0.03)
             heard = [h or bool(one.latencies_us) for h, one in zip(heard, got, strict=True)]
 

@@ -1,4 +1,4 @@
-"""The transports that benchmarks/bus.py compares, and the two sides of one, each for a process of its own.
+"""The transports that benchmarks/bus.py compares, and their sending and receiving processes.
 
 A frame carries the send time (CLOCK_MONOTONIC, one clock for all processes of a machine) at byte 8. A receiver reads
 one byte of every 4096 before it takes the time, so that a transport gains nothing by delivering data that is not yet in
@@ -124,7 +124,7 @@ def _zenoh_session(end: str, address: str) -> Any:
 
 def zenoh_shm_sub(topics: Sequence[str], address: str, got: Got) -> Callable[[], Any]:
     session = _zenoh_session("connect", address)
-    # Its Python binding offers no view of the payload.
+    # Zenoh's Python binding offers no view of the payload, only a copy.
     KEPT.extend(session.declare_subscriber(topic, lambda sample: got(sample.payload.to_bytes())) for topic in topics)
     return threading.Event().wait
 
@@ -213,7 +213,7 @@ def publish(channel: Connection, transport: str, topics: dict[str, int], address
 
 
 def receive(channel: Connection, transport: str, topics: dict[str, int], address: str) -> None:
-    """Run a receiving process: answer each request with the number of frames, or give the receiver and begin anew."""
+    """Run a receiving process: answer requests with the number of frames, or with the receiver, and replace it."""
     receiver = Receiver()
     try:
         run = TRANSPORTS[transport][1](topics, address, lambda *frame: receiver.got(*frame))

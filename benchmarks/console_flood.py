@@ -33,7 +33,7 @@ PING = b'{"type":"ping","client_ms":0}'
 
 
 class Patient(DriveConfig):
-    """Time-outs that no robot may have, so that a busy machine does not trip them."""
+    """Time-outs so long that a busy machine does not trip them; no robot may have them."""
 
     def __post_init__(self) -> None:
         pass

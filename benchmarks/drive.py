@@ -20,8 +20,8 @@ class DriveRecorder:
     """Records a drive from the bus.
 
     Attributes:
-        modes: every change of mode, including the first mode (ControlState.REAL, ...), with its reason in ``reasons``
-            and its time on the machine's steady clock in ``mode_times_s``.
+        modes: the first mode (ControlState.REAL, ...) and every later one, with its reason in ``reasons`` and the time
+            of the change on the machine's steady clock in ``mode_times_s``.
         truth: ground-truth poses of the r-bot, (x, y, yaw) in the world.
         vbot: poses of the v-bot in the map while it was active.
         vbot_pose: newest pose of the v-bot; None before the first.

@@ -4,7 +4,7 @@
     python benchmarks/gpu.py [--step train,views,field-or-warp] [--out runs/gpu]
     python benchmarks/gpu.py --cpu --step train,views --worlds corridor
 
-- train: time until views of the field are within 1 dB of its last. The paper needs 3 to 4 s; target: at most 1 s.
+- train: time until views of the field are within 1 dB of its final ones. The paper needs 3 to 4 s; target: at most 1 s.
 - views: views a second, alone and while training. The paper has 10; target: at least 60 at 1280 x 720.
 - field-or-warp: PSNR and SSIM of the field and of the paper's field (density) against the warp of the same keyframes,
   with one and several keyframes, true and wrong depth, on views of places that were left out.
@@ -48,11 +48,11 @@ FIELD_ONLY = ViewContentConfig(field_alone=True)
 KEYFRAMES = {"one": (0.0,), "three": (-1.5, -0.75, 0.0), "three, one ahead": (-1.5, 3.0, 0.0)}
 """Places of the keyframes along x in metres, in order of arrival."""
 DEPTH_ERRORS = (0.0, 0.04)
-"""Standard deviation of the keyframes' depth, as a share of it."""
+"""Standard deviations of the keyframes' depth errors, as a share of the depth."""
 LEFT_OUT = {0.5: (0.5, 0.0, 0.0), 1.0: (1.0, -0.2, 0.3), 1.5: (1.5, 0.2, -0.4), 2.0: (2.0, 0.0, 0.0)}
 """Places of the judged views by distance from the newest keyframe: x, y in metres, yaw in radians."""
 REPEATS, SLOW_S = 15, 4.0
-"""Timed calls, and the time after which fewer are enough."""
+"""Number of timed calls, and the time in seconds after which fewer are enough."""
 
 
 @dataclass(frozen=True)
@@ -60,7 +60,7 @@ class GpuRun:
     """Options of a run on GPU or CPU.
 
     Attributes:
-        devices: names as in ``VirtualSpaceConfig.device``; the first one is judged.
+        devices: names as in ``VirtualSpaceConfig.device``; field-or-warp uses the first one.
         seconds: longest time of a training.
         worlds: names as in ``make_world``.
         view: size of the views whose quality is measured, width and height in pixels.
@@ -75,7 +75,7 @@ class GpuRun:
     clock: Callable[[], float] = time.perf_counter
 
     def median_s(self, call: Callable[[], object]) -> float:
-        """Return the median time of a call in seconds, after one that does not count."""
+        """Return the median time of a call in seconds, after a first call that is not timed."""
         call()
         times: list[float] = []
         while len(times) < REPEATS and sum(times) < SLOW_S:
@@ -106,7 +106,7 @@ class SimulatedPlace:
 
         Args:
             x: place of the camera along the way, in metres.
-            depth_error: standard deviation of smooth errors of the depth, as a share of it.
+            depth_error: standard deviation of smooth depth errors, as a share of the depth.
         """
         pose = self.start @ pose_matrix(x)
         panorama = self._renderer.render(pose, PANORAMA, PANORAMA // 2, supersample=2)
@@ -116,11 +116,11 @@ class SimulatedPlace:
         return panorama.rgb, depth_m, pose, max(depth_error, 0.02)
 
     def truth(self, pose: Any) -> Any:
-        """Return the world from a pose, (H, W, 3) uint8."""
+        """Return the true view from a pose, (H, W, 3) uint8."""
         return self._renderer.render_perspective(self.start @ pose, *self._view, FOV, supersample=2).rgb
 
     def shown(self, space: VirtualSpace, pose: Any) -> Any:
-        """Return the space from a pose, (H, W, 3) uint8."""
+        """Return the virtual space's view from a pose, (H, W, 3) uint8."""
         return space.render(self.start @ pose, *self._view, FOV).rgb
 
 

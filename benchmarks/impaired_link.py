@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from instant_ic.util.closing import Closing
 
 STALL_S = 0.2
-"""Duration of a retransmission."""
+"""Duration of a stall, as of a TCP retransmission."""
 QUEUE_SEGMENTS, SEGMENT_BYTES = 64, 4096
 """Router queue of each direction; when it is full the sender is blocked."""
 
@@ -26,9 +26,9 @@ class Impairment:
     """Impairment of each direction.
 
     Attributes:
-        delay_s: one way.
-        jitter_s: added to the delay, uniform in ±; the order of bytes is kept.
-        rate_bytes_s: 0 is unlimited.
+        delay_s: one-way delay.
+        jitter_s: largest deviation from the delay, uniform in ±; the order of bytes is kept.
+        rate_bytes_s: largest rate; 0 is unlimited.
         stall_share: share of segments delayed by ``STALL_S``, like a segment whose packet was lost.
     """
 
@@ -88,7 +88,7 @@ class ImpairedLink(Closing):
                 ends.append(far_writer)
                 self._writers.update(ends)
                 await asyncio.gather(self._forward(reader, far_writer), self._forward(far_reader, writer))
-        while self._cut and len(ends) > 1:  # an end that closes during an outage is not seen by the other
+        while self._cut and len(ends) > 1:  # during an outage, neither end sees the other one close
             await asyncio.sleep(0.02)
         self._writers.difference_update(ends)
         for end in ends:

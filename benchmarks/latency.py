@@ -15,8 +15,8 @@ All times start at the browser's time of the key event:
 - ``pixels_forward_ms``, ``pixels_turn_ms``: to the end of the first frame whose pixels, read back from the canvas,
   differ from those before the key. The CPU has rendered the frame by then; the compositor has not shown it yet.
 
-They include the robot's own acceleration: 2 mm take 71 ms at 0.8 m/s2. Reading back delays the frames up to the first
-one that differs.
+All of them include the robot's own acceleration: 2 mm take 71 ms at 0.8 m/s2. Reading back delays the frames up to the
+first one that differs.
 """
 
 from __future__ import annotations
@@ -122,7 +122,7 @@ class SimulatedInput:
         self.stack = stack
         self.error = ""
         self.views = 0
-        """Rendered views of the server, without those that are only judged."""
+        """Views rendered by the server, without those that only measure readiness."""
         self._vbot = np.eye(4)
         self._operator, self._holder = twist_message(), ""  # newest command, and its sender
         self._stop = threading.Event()
@@ -322,7 +322,7 @@ def main() -> int:
         parser.error("--presses must be 2 or more")
     result: dict[str, Any] = {
         "cores": os.cpu_count(),
-        # 1.0 is fast enough for a whole simulated stack in real time. Below it latencies are longer.
+        # At 1.0 the machine runs a whole simulated stack in real time. Below 1.0, latencies are longer.
         "machine_pace": round(machine_pace(), 2),
         "load_average": round(os.getloadavg()[0], 1),
         "targets_ms": {"shown_p50": 50},

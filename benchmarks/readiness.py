@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""The expected PSNR of the virtual space against the one on the operator's page; prints JSON.
+"""The PSNR that the virtual space expects against the PSNR measured on the operator's page; prints JSON.
 
     python benchmarks/readiness.py [--world W[,W]] [--seed S] [--episodes N] [--fit]
 
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from instant_ic.sim.world import World
 
 COLUMNS = 64
-"""Columns of the rays that are judged, as in ``VirtualSpace``."""
+"""Columns of the rays from which readiness is computed, as in ``VirtualSpace``."""
 
 
 class _JudgedStack(FilmedStack):
@@ -69,13 +69,13 @@ def samples(world: str, seed: int, episodes: int) -> list[dict[str, Any]]:
 
 
 def fit(rows: list[dict[str, Any]]) -> list[float]:
-    """Return base and non-negative gains with the least relative error of the squared error, unbiased in dB."""
+    """Fit base and non-negative gains so that the squared error has the least relative error, unbiased in dB."""
     from scipy.optimize import nnls
 
     mse = np.array([10 ** (-row["psnr_db"] / 10) for row in rows])
     matrix = np.array([[1e-3, *row["terms"]] for row in rows])
     weight: NDArray[np.float64] = mse
-    for _ in range(20):  # relative to measured and fitted error alike: large and small errors in dB count the same
+    for _ in range(20):  # weighted by measured and fitted error alike, so that errors in dB count the same
         gains = nnls(matrix / weight[:, None], mse / weight)[0]
         weight = np.sqrt(mse * np.maximum(matrix @ gains, 1e-6))
     gains /= np.exp(np.mean(np.log(matrix @ gains / mse)))

@@ -4,8 +4,8 @@
     python benchmarks/slam.py [--data FOLDER] [--only NAME ...]
     python benchmarks/slam.py --only faults --log NAME [--first N] [--faults NAME ...] [--places N]
 
-Parts: ``long`` (720 beams in a room for a long time, to see whether the cost per scan grows), ``intel``, ``worlds``;
-``faults`` (put into one log) only if named. All use the default parameters. ``ic evaluate slam-sim`` measures the
+Parts: ``long`` (720 beams in a room for a long time, to see whether the cost per scan grows), ``intel`` and ``worlds``.
+``faults`` (put into one log) runs only if named. All use the default parameters. ``ic evaluate slam-sim`` measures the
 simulated crawler.
 """
 

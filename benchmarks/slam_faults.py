@@ -42,9 +42,9 @@ WARM_UP_SCANS = 15
 STEADY_SCANS = 10
 """The robot has recovered when this many scans in a row are trusted and right."""
 RANGE_NOISE_M = 0.01
-"""Added to scans shown for the second time: they must not be equal to those in the map."""
+"""Noise added to scans that are shown a second time, because they must not equal those in the map."""
 WRONG_RAD = 0.2
-"""A relocalization farther from the reference in heading, or by `WRONG_M`, is wrong."""
+"""A relocalization is wrong if its heading is off by more than this, or its position by more than `WRONG_M`."""
 RELOCALIZATION_S, IN_TIME_S = 6.0, 2.0
 """How long a relocalization may take, and how long it should."""
 
@@ -74,9 +74,9 @@ class CleanRun:
     def errors(self, poses: FloatArray, source: NDArray[np.intp], anchor: int | None) -> FloatArray:
         """Return the distance (n,) of ``poses`` (n, 3) from the reference.
 
-        The map may have been optimised since the reference was published, and be optimised again in the run with the
-        fault. The nearest of the reference online, at the end, and relative to the pose of scan ``anchor`` therefore
-        counts; None: no anchor.
+        The map may have been optimised since the reference was published, and may be optimised again in the run with
+        the fault. The smallest of three distances therefore counts: from the reference online, at the end, and relative
+        to the pose of scan ``anchor`` (None: no anchor).
         """
         references = [self.online[source], self.final[source]]
         if anchor is not None:
@@ -102,7 +102,7 @@ def _moved_odometry(entry: LogEntry, moved: FloatArray) -> LogEntry:
 
 
 def heading_jump(entries: Sequence[LogEntry], at: int, end: int, rng: np.random.Generator) -> Faulted:
-    """Turn the odometry by 85° between two scans, for good."""
+    """Turn the odometry by 85° between two scans, permanently."""
     before = entries[at - 1].odom_pose
     moved = np.zeros(3)
     if before is not None:
@@ -127,7 +127,7 @@ def blind(entries: Sequence[LogEntry], at: int, end: int, rng: np.random.Generat
 
 
 def kidnap(entries: Sequence[LogEntry], at: int, end: int, there: int, rng: np.random.Generator) -> Faulted:
-    """Put the robot of scan ``at`` − 1 down where scan ``there`` was taken; its odometry stands meanwhile."""
+    """Move the robot of scan ``at`` − 1 to where scan ``there`` was taken; its odometry does not change meanwhile."""
     part = _part(entries, there)[: end - at]
     odometry, here = entries[at - 1].odom_pose, entries[there].odom_pose
     moved = np.zeros(3) if odometry is None or here is None else compose2(odometry, relative2(here, np.zeros(3)))
@@ -165,7 +165,7 @@ def _steps(slam: GridSlam, entries: Sequence[LogEntry], last_ns: int | None = No
 def _figures(
     slam: GridSlam, faulted: Faulted, clean: CleanRun, anchor: int | None, last_ns: int
 ) -> dict[str, float | int | None]:
-    """Run a part with a fault and return the figures of its place; the time of an event that never came is None.
+    """Run a part with a fault and return the figures of its place; the time of an event that never occurs is None.
 
     ``recovered_after_s`` counts from the fault until ``STEADY_SCANS`` scans in a row are trusted and right.
     """
@@ -218,7 +218,7 @@ def evaluate_faults(
     faults: Sequence[str] = FAULTS,
     on_step: Callable[[str], None] = lambda name: None,
 ) -> dict[str, object]:
-    """Put each fault into the log and compare with the clean run; return figures for JSON, by fault.
+    """Put each fault into the log and compare with the run without faults; return figures for JSON, by fault.
 
     Args:
         entries: scans of the log.
@@ -283,7 +283,7 @@ def relocalizations(
     """
     made, _ = _clean_run(entries[::2], config, [])
     seen = entries[1::2]
-    # Between two scans of the map the robot is between their poses.
+    # The true pose of a scan between two scans of the map is interpolated between theirs.
     stamps = np.array([entry.scan.stamp_ns for entry in entries], dtype=np.float64)
     truth = np.column_stack([
         np.interp(stamps[1::2], stamps[::2], values)
@@ -331,7 +331,7 @@ def _clean_run(
         trusted.append(result.trusted)
         anchored.append(from_anchor(result))
         if k + 1 in at:
-            # The generator has not run the background work of this scan yet: that belongs to the copy, too.
+            # The generator has not run the background work of this scan yet, so the copy will run it, too.
             before.append((k + 1, copy.deepcopy(slam)))
     slam.finish()
     return CleanRun(np.array(online), final_poses(anchored), np.array(trusted), slam), before

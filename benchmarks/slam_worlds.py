@@ -26,10 +26,10 @@ class Laser:
     """A planar laser.
 
     Attributes:
-        beams: per scan.
+        beams: number of beams per scan.
         field_of_view_deg: 360 for a full circle.
-        range_max: metres; beyond it the beam has no return.
-        noise_m: standard deviation (1σ).
+        range_max: metres; a beam has no return beyond it.
+        noise_m: standard deviation of a range.
         mount: base_from_laser (3,).
     """
 
@@ -73,7 +73,7 @@ def drive(
 ) -> Drive:
     """Drive between waypoints, turning on the spot, with a scan every ``step_m`` or ``step_rad``.
 
-    Each odometry step has noise of 5 % (1σ) of its size; all have a scale error of up to 3 %.
+    Each odometry step has noise of 5 % (1σ) of its size; all steps share a scale error of up to 3 %.
 
     Args:
         walls: walls of the building.
@@ -97,7 +97,7 @@ def drive(
         if index:
             step = relative2(poses[index - 1], pose)
             size = np.array([math.hypot(step[0], step[1])] * 2 + [abs(step[2]) + 0.1 * abs(step[0])])
-            rng.random()  # keeps the noise of the published figures
+            rng.random()  # unused; keeps the random sequence, and so the noise, of the published figures
             odometry = compose2(odometry, factor * step + 0.05 * size * rng.standard_normal(3))
         at = compose2(pose, mount)
         angles = laser.angles + at[2]

@@ -8,7 +8,7 @@ back to the real robot.
 
 Each drive has `completed`, `mode_changes` (4 without a stop), `camera_hz`, `page_fps` (frames rendered a second in
 VIRTUAL), `pace` (the stack's seconds per second), `stopped_s` (time in STOPPED from the first key on), the time from
-a key to the first command, and CPU by process in percent of a core. Rates and times are the machine's.
+a key to the first command, and CPU by process in percent of a core. Rates and times are in seconds of the machine.
 """
 
 from __future__ import annotations
@@ -170,7 +170,7 @@ class PageDrive:
         return pose is not None and float(pose[0]) > BEYOND_X_M
 
     def _hold(self, reached: Callable[[], bool], what: str) -> None:
-        """Hold W until the condition is true; release it at a stop and press it again after it."""
+        """Hold W until the condition is true. At a stop, release W and press it again afterwards."""
         end = time.monotonic() + 120
 
         def over() -> bool:

@@ -12,8 +12,9 @@ disconnects, or the emergency stop is pressed. Measured from that moment, by the
                 falls by a tenth
     stand_s     to a true speed that stays below 0.01 m/s, and below a third of the speed before the loss
     distance_m  from the position at the loss to the stopping position
-    after_m     motion in the second after it has stopped: zero, unless what was lost is back before the arbiter has
-                gone to STOPPED (``timeouts.stop_after_s``), as a camera driver that starts fast: the key is still held
+    after_m     motion in the second after it has stopped: zero, unless the lost part is back before the arbiter goes to
+                STOPPED (``timeouts.stop_after_s``), like a camera driver that starts fast, because the key is still
+                held
     again_s     to that motion
 
 For a process that is thawed after 2 s, ``after_m`` is the motion from the stand until 3 s after the end of the freeze:
@@ -73,13 +74,13 @@ STANDS_S = 0.3
 LONGEST_S = 4.0
 AFTER_S = 1.0
 RUNAWAY = 0.95
-"""Share of the top speed; at all of it, the jump from a slow speed alone is a speed error to the controller."""
+"""Share of the top speed for a runaway motor; at full speed, the jump from a slow speed is already a speed error."""
 _TRIES = 5
 _REVOLUTION = 76
 """Packets of a revolution of the LiDAR."""
 PROCESSES = ("arbiter", "crawler_base", "console", "grid_slam", "vlp16_driver", "theta_camera")
 CONTROL = ("arbiter", "crawler_base", "console", "navigator", "virtual_robot")
-"""The last two are not needed in REAL."""
+"""Control nodes that are frozen; the last two are not needed in REAL."""
 LET_GO_S = 0.4
 """Seconds without a key before each drive: after a freeze, the console and the arbiter wait for its release."""
 FROZEN_S, AFTER_THAW_S = 2.0, 3.0
@@ -247,7 +248,7 @@ class SerialRelay(Closing):
                 os.write(self._master, data)
 
     def _with_count(self, reply: bytes) -> bytes:
-        """Return the reply of both counts, the left one as it was when its encoder died."""
+        """Return the reply with both counts, of which the left one is frozen since its encoder died."""
         if not self.dead:
             self._count = reply[:4]
         return encode_reply(self._listener.address, Command.READ_ENCODERS, self._count + reply[4:8])
@@ -364,7 +365,7 @@ def freeze(name: str, nodes: Sequence[str], frozen_s: float = 0.0) -> Fault:
 
     def mends(rig: Rig, page: ConsoleClient) -> None:
         while frozen:
-            with contextlib.suppress(ProcessLookupError):  # on a slow machine the launcher takes it for hung
+            with contextlib.suppress(ProcessLookupError):  # on a slow machine the launcher may kill it as hung
                 os.kill(frozen.pop(), signal.SIGCONT)
 
     return Fault(name, breaks, mends, frozen_s=frozen_s)
@@ -394,7 +395,7 @@ def second_console_fault() -> Fault:
 
 
 def relay_fault(name: str, relay: str, attribute: str, broken: Any, whole: Any) -> Fault:
-    """Return the fault of a relay whose ``attribute`` is ``broken``, and ``whole`` after it."""
+    """Return the fault that sets a relay's ``attribute`` to ``broken``, and to ``whole`` when it ends."""
 
     def put(value: Any) -> Act:
         return lambda rig, page: setattr(getattr(rig, relay), attribute, value)
@@ -557,7 +558,7 @@ async def one(rig: Rig, until: Any, fault: Fault, rng: random.Random) -> dict[st
 
 
 def stands_ns(truth: Sequence[Truth], lost_ns: int, cruise: float) -> int | None:
-    """Return the time at which the robot, driven at ``cruise`` m/s, began to stand for ``STANDS_S``, or None."""
+    """Return when the robot, driven at ``cruise`` m/s, began to stand for ``STANDS_S``; None if it never did."""
     began: int | None = None
     limit = min(STANDS_M_S, cruise / 3)
     for row in truth:
@@ -599,7 +600,7 @@ def measured(rig: Rig, lost_ns: int, cruise: float) -> dict[str, Any]:
 def signs_of_the_stop(rig: Rig, rows: Sequence[Truth], lost_ns: int, cruise: float) -> list[int]:
     """Return the times at which a commanded or true speed is a tenth below that before the loss."""
     signs = [at for at, speed in rig.commands if at >= lost_ns and speed < 0.9 * cruise]
-    if cruise > 5 * STANDS_M_S:  # below, the true speed falls by a tenth by itself
+    if cruise > 5 * STANDS_M_S:  # a slower true speed fluctuates by a tenth by itself
         signs += [row.at_ns for row in rows if row.speed < 0.9 * cruise]
     requests = [(rig.pace.stamp_ns(at), speed) for at, speed in rig.serial.speeds]
     driven = max((request for request in requests if request[0] <= lost_ns), default=(0, 0.0))[1]
