@@ -1,4 +1,4 @@
-"""Virtual space: hash-grid radiance field from a panorama with depth (needs numpy; numba or torch to compute)."""
+"""Virtual space: views from panoramas with depth, by warping or by a hash-grid radiance field (numba or Triton)."""
 
 from instant_ic.geometry.mesh_file import MeshError
 from instant_ic.vspace.config import (

@@ -1,7 +1,7 @@
 """Agreement between keyframes: pixels that show moved objects, and factors that bring colours to one exposure.
 
-1. ``moved``: each keyframe votes on each surface of another: seen, seen through, or unknown. The majority counts.
-2. ``exposure_gains``: robust ratio of the colours of places that two keyframes have both seen.
+1. ``moved``: each keyframe votes on the surfaces of the others: seen, looked through, or unknown. The majority counts.
+2. ``exposure_gains``: robust ratio of the colours of surfaces that two keyframes have both seen.
 """
 
 from __future__ import annotations
@@ -24,13 +24,14 @@ class AgreementConfig:
 
     Attributes:
         same_surface: largest relative difference of two depths of one surface.
-        same_colour: largest difference, in grey levels, between two images of a place that has not changed.
-        vote_rows: rows of the grid of pixels that the keyframes vote on.
-        fit_rows: rows of the grid of pixels that an exposure is fitted to.
-        min_samples: fewest pixels that an exposure is fitted to.
-        max_gain: largest factor of an exposure, and the inverse of the smallest.
+        same_colour: largest difference, in grey levels, between two images of an unchanged surface.
+        vote_rows: rows of the grid of pixels on which the keyframes vote.
+        fit_rows: rows of the grid of pixels to which an exposure is fitted.
+        min_samples: smallest number of pixels to which an exposure is fitted.
+        max_gain: largest factor of an exposure; its inverse is the smallest.
         min_log_gain: logarithm of the smallest factor that counts as different from 1.
-        max_log_spread: widest interval of half the logarithmic ratios; wider means no common factor.
+        max_log_spread: largest width of the interval that holds half of the logarithmic ratios; a wider interval means
+            that there is no common factor.
     """
 
     same_surface: float = 0.06
@@ -47,11 +48,15 @@ CONFIG = AgreementConfig()
 
 
 def moved(priors: Sequence[PanoramaPrior]) -> list[NDArray[np.bool_]]:
-    """Mark the pixels of keyframes (newest first, of one size) that show moved or moving objects, (h, w) each.
+    """Mark the pixels of keyframes that show moved or moving objects, (h, w) each.
 
-    Each keyframe that knows the place of a pixel votes: there is a surface, or it has looked through the place. The
-    majority counts; in a tie, the newest keyframe. A pixel of the newest keyframe stays if another keyframe's image has
-    the same colour there: then the object still stands, and only the depths disagree. Single pixels stay too.
+    Each keyframe that knows the depth towards a pixel's surface votes: it has seen the surface, or looked through it.
+    The majority counts, and the newest keyframe decides a tie. A pixel of the newest keyframe stays if another keyframe
+    shows the same colour there, because then the object is still there and only the depths disagree. Single pixels
+    stay too.
+
+    Args:
+        priors: keyframes of one size, newest first.
     """
     from instant_ic.vspace.agreement_kernels import outvoted
 
@@ -74,7 +79,7 @@ def moved(priors: Sequence[PanoramaPrior]) -> list[NDArray[np.bool_]]:
 def _looks_different(
     mask: NDArray[np.bool_], prior: PanoramaPrior, others: Sequence[PanoramaPrior]
 ) -> NDArray[np.bool_]:
-    """Mark the pixels of a keyframe (h, w) whose places no other keyframe shows in the same colour."""
+    """Mark the pixels of a keyframe (h, w) whose surfaces no other keyframe shows in the same colour."""
     left = mask.copy()
     directions = equirect_directions(mask.shape[1], mask.shape[0])[mask]
     own, pose = prior.colours(directions), prior.map_from_camera.astype(np.float32)
@@ -85,12 +90,12 @@ def _looks_different(
 
 
 def _opened(mask: NDArray[np.bool_], step: int) -> NDArray[np.bool_]:
-    """Remove regions thinner than three cells of ``step`` pixels; dilate the others by two, as edges are soft."""
+    """Remove regions thinner than three cells of ``step`` pixels; dilate others by two, because edges are soft."""
     if not mask.any():
         return mask
     for grow, times in ((False, step), (True, 3 * step)):
         for _ in range(times):
-            for axis in (0, 1):  # columns wrap; so do the rows, where the poles' few pixels do not matter
+            for axis in (0, 1):  # wraps columns; wrapping the rows too affects only a few pixels at the poles
                 before, after = np.roll(mask, 1, axis), np.roll(mask, -1, axis)
                 mask = mask | before | after if grow else mask & before & after
     return mask
@@ -104,7 +109,7 @@ def disagreement(first: PanoramaPrior, second: PanoramaPrior) -> float:
 def exposure_gains(priors: Sequence[PanoramaPrior]) -> Floats:
     """Return the factors that bring each keyframe's colours to those of the newest (the first), (K, 3).
 
-    A keyframe that has too little in common with the newest is fitted to those between them.
+    A keyframe that shares too few surfaces with the newest is fitted to a keyframe between them.
     """
     gains = [np.ones(3, np.float32)]
     for number, older in enumerate(priors[1:], 1):
@@ -120,21 +125,21 @@ def exposure_gains(priors: Sequence[PanoramaPrior]) -> Floats:
 
 
 def exposure_gain(newest: PanoramaPrior, older: PanoramaPrior) -> Floats | None:
-    """Fit factors (3,) that bring an older keyframe's colours to the newest's at places that both have seen.
+    """Fit factors (3,) that bring an older keyframe's colours to the newest's on surfaces that both have seen.
 
-    A factor is the middle of the shortest interval that holds half of a channel's ratios (the shorth). Changes of less
-    than half of the places, such as a lamp or a shadow, do not move it. If no factor differs from 1 by more than its
-    interval's width, the evidence is weak, and all are 1.
+    A factor is the middle of the shortest interval that holds half of a channel's ratios (the shorth). A change of less
+    than half of the surfaces, such as a lamp or a shadow, does not affect it. If no factor differs from 1 by more than
+    its interval's width, the evidence is weak, and all factors are 1.
 
     Returns:
-        The factors; None if both have seen too few places, or their ratios have no common factor.
+        The factors; None if the keyframes share too few surfaces, or if the ratios have no common factor.
     """
     height, width = older.inverse_depth.shape
     step = max(1, height // CONFIG.fit_rows)
     known = ((older.known == 1) & (older.content == ROOM))[::step, ::step]
     depth = 1 / older.inverse_depth[::step, ::step][known]
     directions = equirect_directions(width, height)[::step, ::step][known]
-    # Not by matmul: BLAS would start threads for it, which wait for each other longer than they compute.
+    # einsum instead of matmul, because BLAS would start threads that wait for each other longer than they compute.
     points = depth[:, None] * np.einsum("ij,kj->ik", directions, older.map_from_camera[:3, :3].astype(np.float32))
     points += older.map_from_camera[:3, 3].astype(np.float32)
     local = newest.in_camera(points)

@@ -15,7 +15,7 @@ FOR, AGAINST, NO_OPINION = 1, 2, 0
 
 @njit(**_OPTIONS)
 def panorama_pixel(x, y, z, height, width):  # type: ignore[no-untyped-def]
-    """Return the upper left pixel (row, column) of a point of the camera's frame, and its distance."""
+    """Return the upper left pixel (row, column) of the four around a point in the camera's frame, and its distance."""
     flat = math.sqrt(x * x + y * y)
     u = (math.pi - math.atan2(y, x)) * (width / (2 * math.pi)) - 0.5
     v = (math.pi / 2 - math.atan2(z, flat)) * (height / math.pi) - 0.5
@@ -25,12 +25,12 @@ def panorama_pixel(x, y, z, height, width):  # type: ignore[no-untyped-def]
 
 @njit(**_OPTIONS)
 def opinion(x, y, z, inverse, sure, room):  # type: ignore[no-untyped-def]
-    """Return a keyframe's opinion on a point of its camera's frame.
+    """Return a keyframe's vote on whether a point in its camera's frame is on a surface.
 
-    ``FOR``: it has seen a surface there; ``AGAINST``: it has looked through it; ``NO_OPINION``: the point is hidden, or
-    the depth is not known there.
+    ``FOR``: the keyframe has seen a surface at the point. ``AGAINST``: it has looked through the point. ``NO_OPINION``:
+    the point is hidden, or the depth in its direction is unknown.
 
-    ``room``: share of the distance by which depths may differ.
+    ``room`` is the share of the distance by which depths may differ.
     """
     height, width = inverse.shape
     row, column, away = panorama_pixel(x, y, z, height, width)
@@ -39,7 +39,7 @@ def opinion(x, y, z, inverse, sure, room):  # type: ignore[no-untyped-def]
         return NO_OPINION
     a, b = inverse[row, column] * away, inverse[row, right] * away
     c, d = inverse[below, column] * away, inverse[below, right] * away
-    # At an edge the nearest of the neighbours counts: `a` is the point's distance over the surface's.
+    # At an edge, the nearest of the four pixels counts. `a` is the ratio of the point's distance to the surface's.
     if max(max(a, b), max(c, d)) * (1 + room) < 1:
         return AGAINST
     if min(min(a, b), min(c, d)) <= 1 + room:
@@ -49,15 +49,15 @@ def opinion(x, y, z, inverse, sure, room):  # type: ignore[no-untyped-def]
 
 @njit(**_OPTIONS)
 def outvoted(directions, inverse, sure, map_from_camera, camera_from_map, room, own, step, out):  # type: ignore[no-untyped-def]
-    """Mark the pixels of keyframe ``own`` through which most of the keyframes with an opinion have looked.
+    """Mark the pixels of keyframe ``own`` whose points most of the voting keyframes have looked through.
 
     Args:
         directions: unit vectors of the panorama's pixels in the camera's frame, (h, w, 3).
         inverse, sure: inverse depth and known pixels of all keyframes, newest first, (K, h, w).
         map_from_camera, camera_from_map: poses and their inverses, (K, 4, 4).
-        room: (K,) of each against ``own``.
-        step: distance in pixels between those that are voted on.
-        out: (h, w) uint8; blocks of ``step`` × ``step`` are set to 1.
+        room: tolerance of each keyframe's depth against ``own``, relative to the distance, (K,).
+        step: distance in pixels between the pixels on which the keyframes vote.
+        out: the mask, (h, w) uint8; blocks of ``step`` × ``step`` pixels are set to 1.
     """
     count, height, width = inverse.shape
     middle = step // 2

@@ -3,10 +3,10 @@
 Gaps open at depth edges when the viewpoint moves. Once per keyframe, this module estimates what they show:
 
 1. ``level_planes``: fit floor and ceiling, the horizontal planes on which most steep pixels agree.
-2. ``_hidden_pixels``: mark the pixels behind each depth edge, up to ``reach_rad`` from it, and moved things.
+2. ``_hidden_pixels``: mark the pixels behind each depth edge, up to ``reach_rad`` from it, and moved objects.
 3. ``continuation.continued_walls``: continue floor, ceiling or the column's wall into them, in depth.
-4. ``continuation.continued_colours``: colour them from the visible part of the same surface; ``seen_by`` then takes the
-   colours of older keyframes that saw the place.
+4. ``continuation.continued_colours``: colour them from the visible part of the same surface. ``seen_by`` then takes
+   colours from older keyframes that saw the hidden surface.
 
 The result is fixed in the map, so that views from different poses agree. The ground under the robot is hidden too and
 is continued from the ground around it. Sky is placed at ``sky_m``.
@@ -33,15 +33,15 @@ class BackgroundConfig:
     """Tuning of the background; angles as seen from the keyframe's camera.
 
     Attributes:
-        rows: rows of the images that the background is made in; it is smooth.
+        rows: rows of the images in which the background is computed; few suffice, because the background is smooth.
         reach_rad: largest distance from a depth edge at which hidden pixels are filled.
-        edge_ratio: relative step of the inverse depth that is a depth edge here; less is noise.
+        edge_ratio: relative step of the inverse depth above which there is a depth edge; smaller steps are noise.
         on_plane: largest relative difference of inverse depths at which a pixel is on floor or ceiling.
         behind: factor by which a hidden surface must lie farther than the surface in front of it.
-        steep: smallest sine of the elevation of the pixels that floor and ceiling are fitted to.
+        steep: smallest sine of the elevation of the pixels to which floor and ceiling are fitted.
         plane_tolerance: largest relative difference of a pixel's height from a plane's that still counts as on it.
         plane_share: smallest share of the steep pixels that must lie on a plane.
-        wall_rise: largest sine of the elevation of upright surfaces that walls are taken from.
+        wall_rise: largest sine of the elevation of the pixels from which walls are found.
         same_surface: largest relative difference of depths at which an older keyframe has seen a hidden surface.
         sky_m: distance of the sky in metres.
     """
@@ -61,7 +61,7 @@ class BackgroundConfig:
 
 CONFIG = BackgroundConfig()
 OTHER, FLOOR, CEILING, NOTHING = 0, 1, 2, 9
-"""Kinds of pixels: walls and things, floor, ceiling, and pixels without a surface of the place."""
+"""Kinds of pixels: walls and objects, floor, ceiling, and pixels without a surface of the room."""
 
 
 @dataclass(frozen=True)
@@ -101,7 +101,7 @@ class Background:
         edges = edge_quads(inverse, CONFIG.edge_ratio)
         removed = (content != ROOM) & ~sky
         hole = _hidden_pixels(inverse, edges, kind) | removed
-        # In a room with a floor or a ceiling walls stand upright: their distance along it is the same up and down.
+        # With a floor or a ceiling, walls are vertical, so that a wall's horizontal distance is constant in a column.
         flat = np.sqrt(np.maximum(1 - rise * rise, np.float32(1e-4))) if np.any(levels) else np.ones_like(rise)
         kind[content != ROOM] = NOTHING
         walls = continued_walls(inverse / flat, (kind == OTHER) & (np.abs(rise) < CONFIG.wall_rise), hole)
@@ -111,7 +111,7 @@ class Background:
         colours, opacity = continued_colours(rgb, planes, kind, grown(edges > 0), rise / flat, walls)
         filled = planes.max(axis=0)
         lost = removed & (filled <= 0)
-        if lost.any():  # on no plane: filled from the surroundings
+        if lost.any():  # pixels on no plane are filled from their surroundings
             filled[lost] = fill_holes(np.where(hole, 0, inverse).astype(np.float32), ~hole)[lost]
             colours[lost] = np.rint(fill_holes(np.where(hole[..., None], 0, rgb).astype(np.float32), ~hole)[lost])
             opacity[lost] = 255
@@ -125,9 +125,9 @@ class Background:
         )  # fmt: skip
 
     def seen_by(self, others: Sequence[tuple[PanoramaPrior, Floats]]) -> Background:
-        """Take the colours of other keyframes that have seen places of the background.
+        """Return the background with the colours of other keyframes that have seen a part of it.
 
-        Of several, the keyframe nearest to the place counts, whatever their order.
+        If several keyframes have seen a surface, the one nearest to the surface counts, whatever their order.
 
         Args:
             others: keyframes, and the factors (3,) that bring their colours to this one's exposure.
@@ -158,8 +158,8 @@ class Background:
 
         Args:
             rays: P rays of the view.
-            wanted: pixels that no keyframe has seen, (P,).
-            view: colour (P, 3), depth (P,) and confidence (P,), updated in place; confidence becomes 1 on the sky.
+            wanted: mask of the pixels that no keyframe has seen, (P,).
+            view: colour (P, 3), depth (P,) and confidence (P,); updated in place. Confidence becomes 1 on the sky.
 
         Returns:
             Weight of the estimate in the view, 0 to 1, (P,); 0 where nothing was rendered.
@@ -206,10 +206,11 @@ def level_planes(inverse: Floats, rise: Floats, room: NDArray[np.bool_]) -> list
     Args:
         inverse: inverse depth, (h, w).
         rise: sine of the pixels' elevation in the map, (h, w).
-        room: pixels whose depth is of the place, (h, w).
+        room: pixels whose depth belongs to the room, (h, w).
 
     Returns:
-        Inverse depth of the floor and of the ceiling at each pixel, (h, w) each; 0 where a plane is not met or found.
+        Inverse depth of floor and ceiling at each pixel, (h, w) each; 0 where the ray misses the plane, or if no plane
+        was found.
     """
     planes = []
     for side in (-1, 1):

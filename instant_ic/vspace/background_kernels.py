@@ -12,21 +12,20 @@ from instant_ic.vspace.nerf.march import along, panorama_pixels
 from instant_ic.vspace.warp_kernels import NEAR_M, beyond, rasterize_triangle
 
 SAME_THING = np.float32(2)
-"""A surface nearer than an object's edge by more than this factor is the ground that the object stands on."""
+"""Factor above which a surface nearer than an object's edge is the ground on which the object stands."""
 
 
 @njit(**_OPTIONS)
 def in_front(inverse, depth_edge, level, reach, steps):  # type: ignore[no-untyped-def]
-    """Return the distance of pixels of nearer surfaces from a depth edge.
+    """Write the distance from a depth edge for the pixels of the surface on its near side.
 
-    From the near side of each edge the near surface is followed, as long as it stays nearer than half way between the
-    two sides of that edge.
+    The near surface is followed from each edge while it remains nearer than the middle between the edge's two sides.
 
     Args:
         inverse, depth_edge: arrays of the ``PanoramaPrior``, (h, w).
-        level: (h, w) over 0 on the floor and the ceiling, which hide nothing.
-        reach: pixels at most.
-        steps: out, (h, w) int32: pixels from the edge, from 1; 0 where no edge is near, or on the far side.
+        level: positive on floor and ceiling, which hide nothing, (h, w).
+        reach: largest distance from an edge in pixels.
+        steps: pixels from the edge, counted from 1, (h, w) int32; written; 0 on the far side and far from any edge.
     """
     height, width = inverse.shape
     queue = np.empty(height * width, np.int64)
@@ -97,12 +96,12 @@ def render_quads(  # type: ignore[no-untyped-def]
 def colour_pixels(  # type: ignore[no-untyped-def]
     rgb, shares, camera_from_map, origin, directions, wanted, depth, colour, share
 ):
-    """Write the colours (P, 3) and weights ``share`` (P,), 0 to 1, of a panorama where ``wanted`` (P,), bilinear.
+    """Write a panorama's bilinear colours (P, 3) and weights ``share`` (P,), 0 to 1, to the ``wanted`` pixels (P,).
 
     Args:
         rgb: the panorama, (h, w, 3) uint8.
-        shares: its weights, 0 to 255, (h, w) uint8.
-        depth: places along the rays, (P,).
+        shares: weights of the panorama's pixels, 0 to 255, (h, w) uint8.
+        depth: metres along the rays, (P,).
     """
     height, width = rgb.shape[:2]
     one = np.float32(1)

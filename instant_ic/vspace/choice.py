@@ -1,4 +1,4 @@
-"""Warp or field, by measurement: an older keyframe is a true image from a displaced place, which both must render."""
+"""Choice between warp and field: both render views of older keyframes, whose panoramas are the ground truth."""
 
 from __future__ import annotations
 
@@ -16,20 +16,20 @@ from instant_ic.vspace.nerf.field import Floats, Rays
 from instant_ic.vspace.view import perspective_rays
 
 TRIALS = 2
-"""Older keyframes that are rendered, at most."""
+"""Largest number of older keyframes that are rendered."""
 _SIZE, _FOV = (256, 144), math.pi / 2
-"""Size of a trial's view in pixels, and its field of view: as fine as a panorama of 1024 columns, so that neither side
-is blurred."""
+"""Size of a trial's view in pixels, and its field of view. The resolution is that of a panorama with 1024 columns, so
+that neither image is blurred."""
 
 
 @dataclass(frozen=True)
 class WarpTrial:
-    """A view of an older keyframe as it was, and how well the warp renders it.
+    """A view of an older keyframe, and the error of the warp that renders it from the newest.
 
     Attributes:
-        rays: P rays from that keyframe's place along the newest one's heading.
-        truth: (P, 3), 0..1, in the newest keyframe's exposure.
-        warp_error: (P,) mean squared error of the warp's colour, NaN where nothing is judged.
+        rays: P rays from the older keyframe's position in the direction of the newest keyframe's heading.
+        truth: colours of the older keyframe in the newest's exposure, 0 to 1, (P, 3).
+        warp_error: mean squared error of the warp's colour, (P,); NaN on pixels that are not compared.
     """
 
     rays: Rays
@@ -43,16 +43,16 @@ class WarpTrial:
         Args:
             rays: P rays of the view.
             truth: true colours, 0 to 1, (P, 3).
-            judged: pixels that both the warp and the older keyframe have seen, (P,).
+            judged: mask of the pixels that both the warp and the older keyframe have seen, (P,).
             warped: the warp's colours, (P, 3).
         """
         return cls(rays, truth, np.where(judged, _error(warped, truth), np.float32(np.nan)))
 
 
 def trials(shown: KeyframeSet) -> tuple[WarpTrial, ...]:
-    """Render the views of older keyframes, neither shown nor learnt, by the warp of the newest.
+    """Render, by the newest keyframe's warp, views of older keyframes that are neither shown nor learnt.
 
-    Places hidden from the shown keyframes are left out: the warp has them from the very images that it is judged by.
+    Surfaces hidden from the shown keyframes are left out, because the warp takes their colours from the ground truth.
     """
     newest, found = shown.newest, []
     for older in spread((newest, *shown.kept), TRIALS):
@@ -67,7 +67,7 @@ def trials(shown: KeyframeSet) -> tuple[WarpTrial, ...]:
 
 
 def gain_db(trials: Sequence[WarpTrial], renderings: Sequence[Rendering]) -> float:
-    """Return by how much the field's PSNR exceeds the warp's on pixels that both render; NaN without any."""
+    """Return the PSNR of the field minus that of the warp on pixels that both render; NaN if there are none."""
     warp = field = 0.0
     for trial, (colour, _, confidence) in zip(trials, renderings, strict=True):
         both = np.isfinite(trial.warp_error) & (confidence > 0)
@@ -81,15 +81,15 @@ def _error(colour: Floats, truth: Floats) -> Floats:
 
 
 class Choice:
-    """Which of the two is shown; with hysteresis, so that it does not change to and fro.
+    """The choice between field and warp, with hysteresis against frequent changes.
 
     Args:
-        least_db: gain from which the field is shown; it stays until it is worse than the warp.
+        least_db: smallest gain at which the field is shown; it is then shown until it is worse than the warp.
 
     Attributes:
-        field: the field is shown.
+        field: True if the field is shown.
         gain_db: last measurement; NaN before the first.
-        hopeless: at the rate of its last gain, the field would still lose at the end of its training.
+        hopeless: True if the field, at its last rate of progress, would still be worse at the end of its training.
     """
 
     def __init__(self, least_db: float, field: bool = False) -> None:
@@ -97,7 +97,7 @@ class Choice:
         self._least_db = least_db
 
     def take(self, gain_db: float, spans_left: float = math.inf) -> None:
-        """Take a measurement; ``spans_left``: training left, in units of that since the measurement before."""
+        """Update the choice by a measurement; ``spans_left`` is remaining training over that since the last one."""
         grown, self.gain_db = gain_db - self.gain_db, gain_db
         self.field = gain_db >= (0 if self.field else self._least_db)
         self.hopeless = not self.field and gain_db + max(grown, 0) * spans_left < 0

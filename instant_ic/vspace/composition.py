@@ -13,9 +13,9 @@ from instant_ic.vspace.view import continue_unseen
 Rendering = tuple[Floats, Floats, Floats]
 """Colours (P, 3), 0 to 1, depth along each ray in metres (P,), and confidence (P,)."""
 ALIKE, APART = 0.03, 0.06
-"""Mean colour differences (0 to 1) up to which two images agree, and from which they do not agree at all."""
+"""Mean colour differences (0 to 1) below which two images agree fully, and above which they do not agree at all."""
 AROUND_PIXELS = 5
-"""Side of the window that the difference of two images is averaged over, in pixels."""
+"""Side of the window over which the difference of two images is averaged, in pixels."""
 
 
 @dataclass(frozen=True)
@@ -24,9 +24,9 @@ class ComposedView:
 
     Attributes:
         colour: RGB, 0 to 1, (P, 3).
-        depth: metres along each ray, (P,); 0 where the ray meets nothing.
-        confidence: 1 where a keyframe has seen the place, 0.5 where its depth was filled, 0 elsewhere, (P,).
-        background: weight of the estimated background, 0 to 1, (P,); 0 where a keyframe has seen the place.
+        depth: metres along each ray, (P,); 0 where the ray hits nothing.
+        confidence: 1 on surfaces that a keyframe has seen, 0.5 where their depth was filled, 0 elsewhere, (P,).
+        background: weight of the estimated background, 0 to 1, (P,); 0 on surfaces that a keyframe has seen.
     """
 
     colour: Floats
@@ -60,7 +60,7 @@ def filled_image(view: ComposedView, shape: tuple[int, int], wraps: bool) -> Flo
     Args:
         view: a view of H · W pixels.
         shape: H and W.
-        wraps: the left edge borders on the right edge, as in a panorama.
+        wraps: True if the left edge borders on the right edge, as in a panorama.
     """
     colour = view.colour.reshape(*shape, 3)
     depth, confidence = view.depth.reshape(shape), view.confidence.reshape(shape)
@@ -70,7 +70,7 @@ def filled_image(view: ComposedView, shape: tuple[int, int], wraps: bool) -> Flo
 
 
 def dissolve(before: Floats, after: Floats, share: float) -> Floats:
-    """Blend two images (H, W, 3) where they agree; elsewhere return ``after``, or one thing would appear twice.
+    """Blend two images (H, W, 3) where they agree. Elsewhere take ``after``, so that no object appears twice.
 
     Args:
         before: the old image.

@@ -1,4 +1,4 @@
-"""Parameters of the virtual space and of the node ``nerf``; each class checks its own values."""
+"""Parameters of the virtual space and of the node ``nerf``. Each class checks its own values."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ class FieldConfig:
 
     Attributes:
         levels: hash-grid levels, coarse to fine.
-        log2_table: entries of a level, as a power of two; 18 for more detail and more memory.
-        hidden: width of the network's hidden layer; wider than 32 does not compile for NVIDIA GPUs of capability 9.0.
-        geometry: distance: a signed one; density: the paper's way, eight samples a pixel.
+        log2_table: binary logarithm of a level's number of entries; 18 gives more detail and needs more memory.
+        hidden: width of the network's hidden layer; more than 32 does not compile for NVIDIA GPUs of capability 9.0.
+        geometry: distance: signed distance; density: as in the paper, with eight samples per pixel.
     """
 
     levels: Annotated[int, Range(1, 16)] = 8
@@ -39,10 +39,11 @@ class TrainConfig:
     """One training run over a keyframe.
 
     Attributes:
-        ray_columns: rays of a batch in azimuth; even in solid angle.
-        ray_rows: rays of a batch in height; ray_columns x ray_rows in all, both multiples of 8.
-        iterations: length of a training run; idle after it.
-        seed: seed of the first weights and of the rays.
+        ray_columns: rays of a batch in azimuth, evenly spaced; a multiple of 8.
+        ray_rows: rays of a batch in height, evenly spaced in solid angle; a multiple of 8. A batch has ray_columns x
+            ray_rows rays.
+        iterations: number of iterations of a training run; training is then idle until the next keyframe.
+        seed: seed of the initial weights and of the rays.
     """
 
     ray_columns: Annotated[int, Range(8, 1024)] = 128
@@ -58,12 +59,12 @@ class TrainConfig:
 
 @dataclass(frozen=True)
 class GeometryConfig(Checked):
-    """How the keyframe's depth shapes the field and the occupancy grid.
+    """Use of the keyframe's depth for the field and the occupancy grid.
 
     Attributes:
-        body_below_deg: degrees; below, the panorama shows the robot itself, which is left out; -90: nowhere.
-        sky_share: regions of unknown depth above the horizon, as large a share of the sphere, are sky; 1: none.
-        cell_m: m, smallest cell of the occupancy grid.
+        body_below_deg: degrees; pixels below this elevation show the robot itself and are left out; -90: none.
+        sky_share: smallest share of the sphere at which a region of unknown depth above the horizon is sky; 1: no sky.
+        cell_m: m; smallest cell of the occupancy grid.
     """
 
     body_below_deg: Annotated[float, Range(-90, 0)] = -90.0
@@ -73,13 +74,13 @@ class GeometryConfig(Checked):
 
 @dataclass(frozen=True)
 class ReadinessConfig(Checked):
-    """When the space is fit to show, and how far from the keyframe.
+    """Conditions under which the space may be shown.
 
     Attributes:
-        psnr_db: PSNR of the training rays from which the space is fit to show, or takes over from the one before.
-        plateau_iterations: iterations over which that gain is taken.
-        plateau_db: dB; less gain than this over plateau_iterations also counts as ready.
-        max_radius_m: m from the keyframe, at most, that a view is fit to show.
+        psnr_db: dB; PSNR of the training rays at which the space becomes ready.
+        plateau_iterations: number of iterations over which plateau_db is measured.
+        plateau_db: dB; the space also becomes ready once the PSNR's gain over plateau_iterations is below this.
+        max_radius_m: m; largest distance from the keyframe at which a view may be shown.
     """
 
     psnr_db: Positive = 24.0
@@ -90,13 +91,13 @@ class ReadinessConfig(Checked):
 
 @dataclass(frozen=True)
 class ViewContentConfig(Checked):
-    """Content of a view: the keyframe's panorama warped by its depth, or the field where it is measured to be better.
+    """Content of a view: the keyframe's panorama warped by its depth, or the field if it is measured to be better.
 
     Attributes:
-        field_gain_db: dB by which the field must render older keyframes better than the warp to be shown; it then stays
-            until it is worse.
-        field_alone: the field from its first step on, never the warp, unmeasured: for experiments.
-        refresh_views: number of views over which a new keyframe is blended in; 1: at once.
+        field_gain_db: dB; the field is shown if it renders older keyframes better than the warp by this much, until it
+            is worse than the warp.
+        field_alone: always show the field, without measurement, from its first step on; for experiments.
+        refresh_views: number of views over which a new keyframe is blended in; 1: shown at once.
     """
 
     field_gain_db: Annotated[float, Range(0, 20)] = 0.5
@@ -106,20 +107,21 @@ class ViewContentConfig(Checked):
 
 @dataclass(frozen=True)
 class VirtualSpaceConfig:
-    """Everything about the virtual space but the bus.
+    """Parameters of the virtual space, independent of the bus.
 
     Attributes:
-        source: field: the panorama warped by its depth until the field is measured to be better; warp: that alone, no
-            training; auto: field on a GPU, else warp, because no field trained on a CPU becomes better in time; mesh.
-        mesh: file of a place scanned beforehand (GLB, glTF, PLY, OBJ), with source: mesh.
+        source: field: the panorama warped by its depth until the field is measured to be better; warp: only the warp,
+            without training; auto: field on a GPU, otherwise warp, because a field trained on a CPU does not become
+            better in time; mesh: a place scanned beforehand.
+        mesh: file of the scanned place (GLB, glTF, PLY, OBJ), for source: mesh.
         mesh_pose: pose of the mesh in the map: x, y, z (m), yaw (degrees, counter-clockwise).
         mesh_max_triangles: larger meshes are refused.
-        mesh_fit_colours: a factor a colour, so that the mesh looks like the newest keyframe.
-        device: cpu: numba; cuda: Triton on an NVIDIA GPU, geometry distance only; auto: cuda where it works, else cpu.
-        panorama_width: px; wider panoramas are area-averaged to this.
-        keyframes: newest keyframes that the field is trained on together, 1..8.
-        older: older keyframes, from up to 3 m away, whose pixels show places hidden from the newest; costs nothing per
-            view.
+        mesh_fit_colours: scale each colour channel so that the mesh looks like the newest keyframe.
+        device: cpu: numba; cuda: Triton on an NVIDIA GPU, geometry distance only; auto: cuda if it works, else cpu.
+        panorama_width: px; wider panoramas are area-averaged to this width.
+        keyframes: number of newest keyframes on which the field is trained together, 1..8.
+        older: number of older keyframes within 3 m whose pixels show places hidden from the newest; they cost no time
+            per view.
         view: the keyframe's panorama warped by its depth, or the field.
     """
 
@@ -156,8 +158,8 @@ class NerfConfig(Checked):
 
     Attributes:
         render_fps: target frame rate of requested views; training gets the remaining time.
-        train_ms_per_frame: longest uninterrupted training in ms, and so the longest wait of a requested view. While no
-            view is requested, training has all the time.
+        train_ms_per_frame: longest uninterrupted training in ms, and thus the longest wait of a requested view. While
+            no view is requested, training may use all the time.
         max_view_pixels: largest view that may be requested; larger requests are refused.
         jpeg_quality: JPEG quality of views, 1 to 100.
         robot_mask: image, twice as wide as high, white where the panorama shows the robot itself or its stand (see also

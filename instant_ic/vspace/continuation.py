@@ -1,9 +1,9 @@
 """Continuation of walls, floor and ceiling of a panorama behind nearer surfaces.
 
-1. ``continued_walls``: find the wall behind each hidden pixel. A wall is upright: its visible part above a near surface
-   goes on below. Without a visible part, the planes of the walls at both sides go on.
-2. ``continued_colours``: colour each surface from its own visible part, and mix the surfaces within a pixel of the line
-   where they meet. Floor and ceiling are level planes, so that a row lies at one distance.
+1. ``continued_walls``: find the wall behind each hidden pixel. Walls are vertical, so the part visible above a near
+   surface is continued below it. If no part is visible, the planes of the walls on both sides are extended.
+2. ``continued_colours``: colour each surface from its own visible part, and mix two surfaces within a pixel of the line
+   where they meet. Floor and ceiling are horizontal, so that all pixels of a row are at the same distance.
 """
 
 from __future__ import annotations
@@ -24,23 +24,23 @@ class ContinuationConfig:
 
     Attributes:
         same: largest ratio of neighbouring distances of one surface.
-        wall_behind: smallest ratio of a wall's distance to that of the surface before it; nearer ones are hidden by the
-            depth's error.
+        wall_behind: smallest ratio of a wall's distance to that of the surface in front of it; walls that are nearer
+            cannot be distinguished from errors of the depth.
         far_share: share of a column's upright surfaces, from the far end, that count as its farthest wall.
-        look_rad: height above a near surface in which its wall is looked for.
+        look_rad: height above a near surface in which the wall behind it is searched.
         span_rad: width over which a wall's plane is fitted.
-        search_rad: largest distance at which colours are looked for.
-        slope_prior: number of pseudo-observations of a wall at right angles to the ray.
+        search_rad: largest distance at which colours are searched.
+        slope_prior: number of pseudo-observations of a wall perpendicular to the ray.
         farthest_m: largest distance of a continued wall, in metres.
-        fade_rad: distance over which a wall's own pixels fade into its common colour.
-        wall_colours: number of pixels that a wall's common colour is the median of.
-        level_colours: the same for floor and ceiling.
-        floor_opacity: weight of the continued floor in the view; the rest is filled from the view's surroundings.
-        ceiling_opacity: the same for the ceiling.
-        beside_opacity: the same for a wall continued from beside, at its visible part; below its visible part it is 1,
-            because a wall that leads on beside a doorway is uncertain and one that leads on downwards is not.
-        least_opacity: the same far from its visible part.
-        opacity_fade_rad: distance over which that weight falls by a factor of e.
+        fade_rad: distance over which a wall's pixels fade into the wall's median colour.
+        wall_colours: number of pixels for the median colour of a wall.
+        level_colours: number of pixels for the median colour of floor or ceiling.
+        floor_opacity: weight of the continued floor in the view; the remainder is filled from neighbouring pixels.
+        ceiling_opacity: weight of the continued ceiling.
+        beside_opacity: weight of a sideways continued wall, next to its visible part. A wall continued downwards has
+            weight 1. Sideways is less certain, because the wall may end, for instance at a doorway.
+        least_opacity: weight of a sideways continued wall far from its visible part.
+        opacity_fade_rad: distance over which the weight of a sideways continued wall falls by a factor of e.
     """
 
     same: float = 1.15
@@ -71,8 +71,8 @@ class HiddenSurfaces:
     Attributes:
         hole: hidden pixels, (h, w).
         upright: inverse horizontal distance of the visible surfaces, 1/m, (h, w).
-        far: inverse horizontal distance of the farthest wall of each column, (w,); 0 where there is none.
-        found: inverse horizontal distance of the wall behind each hidden pixel, (h, w); 0 where there is none.
+        far: inverse horizontal distance of the farthest wall of each column, (w,); 0 if there is none.
+        found: inverse horizontal distance of the wall behind each hidden pixel, (h, w); 0 if there is none.
     """
 
     hole: NDArray[np.bool_]
@@ -86,8 +86,8 @@ def continued_walls(upright: Floats, wall: NDArray[np.bool_], hole: NDArray[np.b
 
     Args:
         upright: inverse of the horizontal distance, 1/m, (h, w).
-        wall: pixels whose distance is of something upright, (h, w).
-        hole: near surfaces, (h, w).
+        wall: mask of pixels on upright surfaces, (h, w).
+        hole: mask of pixels on near surfaces, (h, w).
     """
     from instant_ic.vspace import continuation_kernels as kernels
 
@@ -114,20 +114,20 @@ def continued_colours(
 
     Args:
         rgb: panorama, (h, w, 3).
-        planes: inverse depth of walls, floor and ceiling where they lie behind, (3, h, w); 0 where they do not.
-        kind: the one of them that a pixel shows, (h, w).
-        edge: pixels beside a depth edge, which have colours of both sides, (h, w).
+        planes: inverse depth of hidden wall, floor and ceiling at each pixel, (3, h, w); 0 where there is none.
+        kind: surface that a pixel shows, an index into ``planes``, (h, w).
+        edge: mask of pixels beside a depth edge, which mix the colours of both sides, (h, w).
         slope: tangent of the elevation, (h, w).
-        walls: walls of ``continued_walls``.
+        walls: result of ``continued_walls``.
 
     Returns:
-        The panorama with hidden pixels in the hidden surfaces' colours, (h, w, 3), and their opacity, (h, w) uint8.
+        The panorama with the hidden surfaces' colours in hidden pixels, (h, w, 3), and their opacity, (h, w) uint8.
     """
     hole, upright = walls.hole, walls.upright
     total, covered, sure = np.zeros(rgb.shape, np.float32), np.zeros(hole.shape, np.float32), np.zeros_like(upright)
-    weight = np.maximum(upright, np.float32(1e-3)) ** np.float32(-4)  # far surfaces go on behind near ones
+    weight = np.maximum(upright, np.float32(1e-3)) ** np.float32(-4)  # far surfaces are continued behind near ones
     for number, plane in enumerate(planes):
-        # Within a pixel of the line where two planes meet both have a share.
+        # Two planes are mixed within a pixel of the line where they meet.
         ahead = plane - np.delete(planes, number, 0).max(axis=0)
         step = np.maximum(np.abs(np.gradient(ahead, axis=0)), np.float32(1e-6))
         coverage = (np.clip(np.float32(0.5) + ahead / step, 0, 1) * (hole & (plane > 0))).astype(np.float32)
@@ -159,7 +159,7 @@ def _continued_surface(
     """Continue the colours of one surface: walls (0), floor (1) or ceiling (2).
 
     Returns:
-        Pixels that show the surface (h, w), colours (h, w, 3), −1 where none was found, and their opacity (h, w).
+        Pixels that show the surface (h, w), their colours (h, w, 3), −1 if none was found, and their opacity (h, w).
     """
     from instant_ic.vspace import continuation_kernels as kernels
 
@@ -168,7 +168,7 @@ def _continued_surface(
     reach, same = _pixels(CONFIG.search_rad, height), np.float32(CONFIG.same)
     colour = np.full(rgb.shape, -1, np.float32)
     if number:
-        # Skirting and the feet of furniture are within the floor's tolerance, but not of its colour.
+        # Skirting and the feet of furniture lie on the floor's plane within its tolerance, but differ in colour.
         source = ~grown(grown(kind != number)) & ~edge
         kernels.continue_level(rgb, source, hole, coverage, reach, CONFIG.level_colours, colour)
         opacity = CONFIG.floor_opacity if number == 1 else CONFIG.ceiling_opacity

@@ -12,12 +12,13 @@ from instant_ic.vspace.nerf.kernels import _OPTIONS
 
 @njit(**_OPTIONS)
 def farthest_walls(upright, wall, share, far):  # type: ignore[no-untyped-def]
-    """Return the distance of the farthest walls around a keyframe, by direction.
+    """Write the inverse distance of the farthest wall in each column of a panorama.
 
     Args:
-        upright: inverse of the horizontal distance, (h, w); wall: (h, w) where that is of anything upright.
-        share: quantile of a column that counts, from the far end.
-        far: out, (w,) inverse distance, 0 where no wall is seen.
+        upright: inverse of the horizontal distance, (h, w).
+        wall: mask of pixels on upright surfaces, (h, w).
+        share: quantile of a column's distances, from the far end, that counts as its farthest wall.
+        far: inverse horizontal distance of the wall, (w,); written; 0 if no wall is visible.
     """
     height, width = upright.shape
     column = np.empty(height, np.float32)
@@ -36,17 +37,19 @@ def walls_behind(  # type: ignore[no-untyped-def]
 ):
     """Continue upright walls behind near surfaces.
 
-    A wall that is visible above a near surface goes on behind it. If none is visible, the planes of the walls at its
-    left and right go on; two of them meet in a corner.
+    A wall that is visible above a near surface is continued behind it. If no wall is visible there, the planes of the
+    walls on the left and right are extended until they meet in a corner.
 
     Args:
-        upright, wall: as in ``farthest_walls``; hole: near surfaces, (h, w).
+        upright, wall: as in ``farthest_walls``.
+        hole: mask of pixels on near surfaces, (h, w).
         far: result of ``farthest_walls``.
-        look, span: rows above a near surface, and columns beside it, that a wall is fitted to.
-        same: neighbours whose distances differ by less than this factor are one surface.
-        behind: factor by which a wall must be farther than the surface before it.
-        slope_prior: pseudo-observations for a wall at right angles to the ray; farthest: in metres.
-        found: out, (h, w) inverse horizontal distance of the wall, 0 where there is none.
+        look, span: rows above a near surface, and columns beside it, to which a wall is fitted.
+        same: largest ratio of neighbouring distances of one surface.
+        behind: smallest ratio of a wall's distance to that of the surface in front of it.
+        slope_prior: number of pseudo-observations of a wall perpendicular to the ray.
+        farthest: largest distance of a continued wall, in metres.
+        found: inverse horizontal distance of the wall, (h, w); written; 0 if there is none.
     """
     height, width = upright.shape
     found[:] = 0
@@ -84,7 +87,7 @@ def _alike(a, b, factor):  # type: ignore[no-untyped-def]
 
 @njit(**_OPTIONS)
 def _plane_beside(upright, far, u, row, hidden, side, span, same, behind, slope_prior, farthest):  # type: ignore[no-untyped-def]
-    """Return the inverse distance at column ``u`` of the plane beside the surface that hides it; 0 without one."""
+    """Return the inverse distance at column ``u`` of the wall that is visible on one side; 0 if there is no wall."""
     width = far.shape[0]
     step = np.float32(2 * math.pi / width)
     front = hidden
@@ -98,9 +101,9 @@ def _plane_beside(upright, far, u, row, hidden, side, span, same, behind, slope_
             front = far[anchor]
     else:
         return np.float32(0)
-    anchor = (anchor + 2 * side) % width  # the first columns are of both sides
+    anchor = (anchor + 2 * side) % width  # the first columns mix near surface and wall
     gap += 2
-    # q(a) = x cos a + y sin a by the angle a from the anchor, away from the gap, is a plane.
+    # A plane is q(a) = x cos a + y sin a, where a is the angle from the anchor, away from the gap.
     sum_cc, sum_cs, sum_ss, sum_cq, sum_sq = 0.0, 0.0, 0.0, 0.0, 0.0
     last = far[anchor]
     for k in range(span):
@@ -124,10 +127,12 @@ def _plane_beside(upright, far, u, row, hidden, side, span, same, behind, slope_
 
 @njit(**_OPTIONS)
 def wall_colours(rgb, source, upright, far, same, colours):  # type: ignore[no-untyped-def]
-    """Write the common colour of the farthest wall in each column, (w, 3) float32; −1 where it is not seen.
+    """Write the common colour of the farthest wall in each column, (w, 3) float32; −1 if it is not visible.
 
     Args:
-        rgb: (h, w, 3); source: (h, w) pixels of walls; upright, far, same: as in ``walls_behind``.
+        rgb: panorama, (h, w, 3).
+        source: mask of pixels that show walls, (h, w).
+        upright, far, same: as in ``walls_behind``.
     """
     height, width = source.shape
     some = np.empty((height, 3), np.float32)
@@ -147,8 +152,10 @@ def _colour_above(rgb, source, upright, found, v, u, same, some, total):  # type
     """Write the median colour of the wall's visible part above a pixel; return False if there is none.
 
     Args:
-        rgb, source, upright, found, same: as in ``continue_walls``; v, u: the pixel.
-        some: scratch, (most, 3); total: out, (3,).
+        rgb, source, upright, found, same: as in ``continue_walls``.
+        v, u: row and column of the pixel.
+        some: scratch memory, (most, 3).
+        total: the colour, (3,); written.
     """
     count, first = 0, 0
     for n in range(v - 1, -1, -1):
@@ -168,14 +175,16 @@ def _colour_above(rgb, source, upright, found, v, u, same, some, total):  # type
 def _colour_beside(  # type: ignore[no-untyped-def]
     rgb, source, slope, upright, far, found, column_colour, v, u, side, same, fade, reach, some, total
 ):
-    """Add the colour of the wall at one side of a pixel to ``total`` (3,).
+    """Add the colour of the wall on one side of a pixel to ``total`` (3,).
 
     Args:
-        side: −1 left, 1 right; v, u: the pixel; some: scratch, (most, 3).
         rgb, source, slope, upright, far, found, column_colour, same, fade, reach: as in ``continue_walls``.
+        v, u: row and column of the pixel.
+        side: −1 left, 1 right.
+        some: scratch memory, (most, 3).
 
     Returns:
-        Its weight and its distance in columns; weight 0 if no wall is seen there.
+        Weight of the colour and distance of the wall in columns; weight 0 if no wall is visible on this side.
     """
     height, width = source.shape
     rows = np.float32(height / math.pi)
@@ -215,18 +224,22 @@ def continue_walls(  # type: ignore[no-untyped-def]
 ):  # fmt: skip
     """Continue the colours of walls into holes.
 
-    The colour of the wall's visible part above counts first. Without one, those of both sides count: near them the
-    colours at the same height, farther away the wall's common colour.
+    If the wall is visible above a pixel, its colour is taken from there. Otherwise the visible parts on both sides are
+    mixed: near them, with their colours at the same height; farther away, with the wall's median colour.
 
     Args:
-        rgb: panorama, (h, w, 3); source: pixels of walls, (h, w).
-        hole: pixels to fill, (h, w); coverage: share of the wall in each of them; those above 0 are coloured, (h, w).
-        slope: tangent of each pixel's elevation, (h, w); upright, far, found, same: as in ``walls_behind``.
-        column_colour: colours of ``wall_colours``; fade: pixels; reach: largest number of columns that are searched.
-        most: number of pixels that a common colour is the median of.
-        sure_share, sure_fade: opacity beside a visible part, and columns over which it falls by e.
-        colour: result, (h, w, 3) float32; −1 where nothing was found.
-        sure: resulting opacity, (h, w); 1 below a visible part of the wall.
+        rgb: panorama, (h, w, 3).
+        source, hole: masks of the pixels that show walls, and of the pixels to fill, (h, w) each.
+        coverage: share of the wall in each pixel; pixels above 0 are coloured, (h, w).
+        slope: tangent of each pixel's elevation, (h, w).
+        upright, far, found, same: as in ``walls_behind``.
+        column_colour: colours of ``wall_colours``.
+        fade: columns over which colours at the same height fade into the median colour.
+        reach: largest number of columns that are searched.
+        most: number of pixels for a median colour.
+        sure_share, sure_fade: opacity beside a visible part, and columns over which it falls by a factor of e.
+        colour: colours of the hidden walls, (h, w, 3) float32; written; −1 if none was found.
+        sure: opacity, (h, w); written; 1 below a visible part of the wall.
     """
     height, width = hole.shape
     some = np.empty((most, 3), np.float32)
@@ -252,11 +265,11 @@ def continue_walls(  # type: ignore[no-untyped-def]
 
 @njit(**_OPTIONS)
 def continue_level(rgb, source, hole, coverage, reach, most, colour):  # type: ignore[no-untyped-def]
-    """Continue the floor or the ceiling into holes from both sides along rows: a row lies at one distance.
+    """Continue floor or ceiling into holes along rows, because all pixels of a row are at the same distance.
 
     Args:
         rgb, source, hole, coverage, reach, colour: as in ``continue_walls``.
-        most: pixels of a side that a colour is the median of, fewer close by.
+        most: number of pixels on each side for a median colour; fewer are used close by.
     """
     height, width = hole.shape
     some = np.empty((most, 3), np.float32)

@@ -1,4 +1,4 @@
-"""CPU kernels of ``prior`` (numba): filling holes, each pixel read once, and the ends of assumed tops."""
+"""CPU kernels of ``prior`` in numba: hole filling, and cutting of assumed tops of objects."""
 
 from __future__ import annotations
 
@@ -10,20 +10,20 @@ from instant_ic.vspace.nerf.kernels import _OPTIONS
 
 
 def fill(values: NDArray[np.float32], weight: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Fill the pixels of ``values`` (H, W, C) with ``weight`` (H, W) 0 from around; see ``prior.fill_holes``."""
+    """Fill pixels of ``values`` (H, W, C) whose ``weight`` (H, W) is 0 from around them; see ``prior.fill_holes``."""
     sizes = [weight.shape]
     while min(sizes[-1]) > 1:
         sizes.append(((sizes[-1][0] + 1) // 2, (sizes[-1][1] + 1) // 2))
     count = sum(height * width for height, width in sizes)
     filled = np.array(values, np.float32, order="C")
-    weight = np.ascontiguousarray(weight)  # numba would compile the kernel once more for another order
+    weight = np.ascontiguousarray(weight)  # numba would compile the kernel again for another memory order
     pull_push(filled, weight, np.array(sizes, np.int64), np.zeros((count, filled.shape[2] + 1), np.float32))
     return filled
 
 
 @njit(**_OPTIONS)
 def pull_push(values, weight, sizes, levels):  # type: ignore[no-untyped-def]
-    """Fill in place; ``levels``, zeros at first, takes the weighted sums and weights of all levels in turn."""
+    """Fill ``values`` in place. ``levels``, initially zeros, receives the weighted sums and weights of all levels."""
     channels = values.shape[2]
     height, width = weight.shape
     holes = 0
@@ -64,7 +64,7 @@ def pull_push(values, weight, sizes, levels):  # type: ignore[no-untyped-def]
                     continue
                 x0 = x // 2
                 x1 = max(x0 - 1, 0) if x % 2 == 0 else min(x0 + 1, wc - 1)
-                # Bilinear, weights 3/4 and 1/4 an axis; a quarter of it, as one pixel is a quarter of the coarser.
+                # Bilinear with weights 3/4 and 1/4 per axis, divided by 4, because a coarse pixel sums four fine ones.
                 a, b, c0, d = below + y0 * wc + x0, below + y0 * wc + x1, below + y1 * wc + x0, below + y1 * wc + x1
                 for c in range(channels + 1):
                     value = np.float32(9) * levels[a, c] + np.float32(3) * (levels[b, c] + levels[c0, c]) + levels[d, c]
@@ -80,18 +80,20 @@ def pull_push(values, weight, sizes, levels):  # type: ignore[no-untyped-def]
 
 @njit(**_OPTIONS)
 def cut_tops(inverse, sigma, rgb, room, reach, step, assumed, contrast, share):  # type: ignore[no-untyped-def]
-    """End the assumed tops of things where the image does: beyond, the surface above goes on.
+    """Cut the assumed tops of objects at the upper edge that the image shows.
 
-    A top is assumed where its depth is less certain than that of the thing below it. Its rows, from above, belong to
-    the surface above as long as they have that surface's colour.
+    A top is assumed if its depth is less certain than that of the object below it. From above, its rows belong to the
+    surface above the object as long as they have that surface's colour, and they then get that surface's depth.
 
     Args:
-        inverse, sigma: inverse depth and its relative standard deviation, (h, w) float32; in and out.
-        rgb: (h, w, 3) float32; room: (h, w) where pixels show surfaces.
+        inverse, sigma: inverse depth and its relative standard deviation, (h, w) float32; updated in place.
+        rgb: panorama, (h, w, 3) float32.
+        room: mask of pixels that show surfaces of the room, (h, w).
         reach: largest number of rows of a top.
-        step: factor by which a thing is nearer than the surface above it.
-        assumed: sigma of an assumed depth, at least, and at least twice that of the thing.
-        contrast: least difference of the colours of both; share: share of the thing's colour in a pixel of it.
+        step: smallest ratio of inverse depth from the surface above to the object.
+        assumed: smallest sigma of an assumed depth, which must also be at least twice the object's sigma.
+        contrast: smallest difference between the colours of object and surface.
+        share: share of the object's colour above which a pixel belongs to the object.
     """
     height, width = inverse.shape
     above, thing = np.zeros(3, np.float32), np.zeros(3, np.float32)

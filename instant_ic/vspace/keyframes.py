@@ -21,7 +21,7 @@ REACH_M = 3.0
 APART_M = 0.25
 """Smallest distance between two keyframes that are kept, in metres."""
 RECENT = 7
-"""Number of keyframes kept: the last 3.6 m of a drive with one each 0.6 m."""
+"""Number of keyframes kept, which cover the last 3.6 m of a drive at one keyframe per 0.6 m."""
 
 
 @dataclass(frozen=True)
@@ -56,7 +56,7 @@ class Keyframe:
         """Return the keyframe without moved objects.
 
         Args:
-            moved: pixels that show them, (h, w); pixels left out before and not among them count again.
+            moved: mask of pixels that show them, (h, w). It replaces the mask of an earlier call.
         """
         prior = self.prior.without(moved)
         return self if prior is self.prior else Keyframe.build(prior, self.warp.pyramid)
@@ -69,7 +69,7 @@ class KeyframeSet:
     Attributes:
         keyframes: keyframes that the field learns from together, newest first.
         gains: factors that bring each keyframe's colours to the newest's exposure, (K, 3).
-        kept: older keyframes, newest first, whose pixels show places hidden from the newest.
+        kept: older keyframes, newest first, whose pixels show surfaces hidden from the newest.
     """
 
     keyframes: tuple[Keyframe, ...]
@@ -88,13 +88,13 @@ class KeyframeSet:
 
 
 def extended(prior: PanoramaPrior, shown: KeyframeSet | None, count: int, older: int) -> KeyframeSet:
-    """Prepare a new keyframe, with the earlier ones of its size that are used with it.
+    """Prepare a new keyframe together with earlier keyframes of the same size.
 
     Args:
         prior: the new keyframe.
-        shown: keyframes in use before; None before the first.
-        count: number of keyframes that the field learns from, in one exposure and without moved objects.
-        older: number of older keyframes that give their pixels of places hidden from the new one.
+        shown: keyframes used so far; None before the first.
+        count: number of keyframes that the field learns, in one exposure and without moved objects.
+        older: number of older keyframes that contribute pixels of surfaces hidden from the new one.
     """
     before = () if shown is None else (*shown.keyframes, *shown.kept)
     size = (prior.rgb.shape, prior.inverse_depth.shape)
@@ -114,9 +114,10 @@ def extended(prior: PanoramaPrior, shown: KeyframeSet | None, count: int, older:
 
 
 def spread(keyframes: Sequence[Keyframe], count: int) -> list[Keyframe]:
-    """Choose the older keyframes that show most of the places hidden from the newest.
+    """Choose the older keyframes that show most of the surfaces hidden from the newest.
 
-    The farthest within ``REACH_M`` comes first, then those farthest from all chosen before, ``APART_M`` at least.
+    The first is the farthest within ``REACH_M``. Each further one is the farthest from all chosen ones, if it is at
+    least ``APART_M`` away.
 
     Args:
         keyframes: the newest, then older ones from new to old.
@@ -136,7 +137,7 @@ def spread(keyframes: Sequence[Keyframe], count: int) -> list[Keyframe]:
 
 
 def recent(keyframes: Iterable[Keyframe]) -> tuple[Keyframe, ...]:
-    """Return the newest ``RECENT`` keyframes that lie ``APART_M`` from each other, newest first."""
+    """Return the newest ``RECENT`` keyframes that are at least ``APART_M`` apart, newest first."""
     kept: list[Keyframe] = []
     for keyframe in keyframes:
         if all(np.linalg.norm(other.position - keyframe.position) >= APART_M for other in kept):

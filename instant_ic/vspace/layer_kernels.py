@@ -1,4 +1,4 @@
-"""Kernels of ``layer_mesh`` (numba)."""
+"""CPU kernels of ``layer_mesh`` (numba)."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ from numba import njit
 from instant_ic.vspace.nerf.kernels import _OPTIONS
 
 SAME_SURFACE = 0.1
-"""Pixels round a corner show the same surface when their inverse depths differ by no more than this share."""
+"""Largest relative difference of inverse depths at which pixels around a corner show the same surface."""
 
 
 @njit(**_OPTIONS)
 def corner_values(inverse, torn):  # type: ignore[no-untyped-def]
-    """Return the inverse depth at the pixels' corners, (h + 1, w): the mean around them, at the poles of the row."""
+    """Return the inverse depth at the pixels' corners, (h + 1, w): the mean of the pixels around, at poles of a row."""
     height, width = inverse.shape
     corners = np.empty((height + 1, width), np.float32)
     for u in range(width):
@@ -28,9 +28,9 @@ def corner_values(inverse, torn):  # type: ignore[no-untyped-def]
 
 @njit(**_OPTIONS)
 def _apart(corners, directions, a, b, c, m):  # type: ignore[no-untyped-def]
-    """Return the inverse depth's error at corner ``m`` of the plane through corners ``a``, ``b``, ``c`` (row, column).
+    """Return the error of the inverse depth at corner ``m`` on the plane through corners ``a``, ``b`` and ``c``.
 
-    A plane's inverse depth is linear in the direction.
+    Corners are (row, column). On a plane the inverse depth is a linear function of the direction.
     """
     width = corners.shape[1]
     da, db = directions[a[0], a[1] % width], directions[b[0], b[1] % width]
@@ -51,15 +51,16 @@ def _apart(corners, directions, a, b, c, m):  # type: ignore[no-untyped-def]
 
 @njit(**_OPTIONS)
 def lattice_errors(corners, directions, alone, tile):  # type: ignore[no-untyped-def]
-    """Return the error that leaving out each corner makes, here or further down, (h + 1, w).
+    """Return the largest error of the inverse depth if a corner, and all corners that depend on it, are left out.
 
-    A corner is the middle of the longest side of the two triangles that it splits. Of a square of side s the centre is
-    split first, then the middles of the sides, then the centres of its quarters. So the error of a corner is at least
-    that of the corners split after it.
+    A corner is the middle of the longest side of the two triangles that it splits. A square is split first at its
+    centre, then at the middles of its sides, then at the centres of its quarters. The error of a corner is at least
+    that of the corners split after it. The result is (h + 1, w).
 
     Args:
-        corners: inverse depth (h + 1, w); directions: (h + 1, w, 3).
-        alone: (h, w) pixels that are squares of their own: their corners are never left out.
+        corners: inverse depth at the corners, (h + 1, w).
+        directions: unit vectors of the corners, (h + 1, w, 3).
+        alone: mask of pixels that are separate squares, whose corners are never left out, (h, w).
         tile: side of the largest squares, in pixels, a power of two.
     """
     height, width = alone.shape
@@ -95,7 +96,7 @@ def lattice_errors(corners, directions, alone, tile):  # type: ignore[no-untyped
                 errors[v, u] = worst
         for v in range(half, height, side):  # centres
             for u in range(half, width, side):
-                # The diagonal leads to the centre of the square that this one is a quarter of.
+                # The diagonal points to the centre of the next larger square.
                 if ((v // side) + (u // side)) % 2 == 0:
                     a, b, c, d = (v - half, u - half), (v + half, u + half), (v - half, u + half), (v + half, u - half)
                 else:
@@ -117,9 +118,10 @@ def _push(stack, n, cv, cu, av, au, bv, bu):  # type: ignore[no-untyped-def]
 
 @njit(**_OPTIONS)
 def _leaves(errors, alone, tile, limit, out):  # type: ignore[no-untyped-def]
-    """Write the triangles, rows and columns of apex and long side, (T, 6) int32, to ``out``; return their number.
+    """Write the triangles to ``out``, (T, 6) int32: row and column of the apex and of the long side's two ends.
 
-    Triangles in pixels that are alone are left out. With ``out`` of no rows they are only counted.
+    Return the number of triangles; if ``out`` has no rows, they are only counted. Triangles in pixels that are
+    ``alone`` are left out.
     """
     height, width = alone.shape
     stack = np.empty((64, 6), np.int32)
@@ -165,14 +167,14 @@ def count_triangles(errors, alone, shown, tile, limit):  # type: ignore[no-untyp
 
 @njit(**_OPTIONS)
 def _inner_slope(own, inner, shown):  # type: ignore[no-untyped-def]
-    """Return the change of inverse depth from the pixel on the inner side; 0 where that is another surface."""
+    """Return the change of inverse depth from the pixel on the inner side; 0 if that pixel shows another surface."""
     same = shown and abs(own - inner) <= SAME_SURFACE * min(own, inner)
     return own - inner if same else np.float32(0)
 
 
 @njit(**_OPTIONS)
 def _continued(inverse, shown, v, u, down, right):  # type: ignore[no-untyped-def]
-    """Return the inverse depth of a pixel's continued surface at its corner ``down``, ``right`` (0 or 1 each)."""
+    """Return the inverse depth at a pixel's corner (``down``, ``right``: 0 or 1) if its surface is continued."""
     height, width = inverse.shape
     own = inverse[v, u]
     side, above = (u + 1 - 2 * right) % width, min(max(v + 1 - 2 * down, 0), height - 1)
@@ -182,7 +184,7 @@ def _continued(inverse, shown, v, u, down, right):  # type: ignore[no-untyped-de
 
 @njit(**_OPTIONS)
 def _edge_value(inverse, shown, v, u, down, right):  # type: ignore[no-untyped-def]
-    """Return the inverse depth at a corner of a pixel on a depth edge: the mean of its surface's pixels around."""
+    """Return the inverse depth at a corner of a pixel on a depth edge: the mean of the same surface's pixels around."""
     height, width = inverse.shape
     own = _continued(inverse, shown, v, u, down, right)
     total, count = own, 1
@@ -200,7 +202,7 @@ def _edge_value(inverse, shown, v, u, down, right):  # type: ignore[no-untyped-d
 
 @njit(**_OPTIONS)
 def write_triangles(errors, alone, shown, torn, inverse, corners, tile, limit, places, values, indices):  # type: ignore[no-untyped-def]
-    """Write vertices and triangles; returns the number of vertices."""
+    """Write vertices and triangles, and return the number of vertices."""
     height, width = alone.shape
     at = np.full((height + 1, width), -1, np.int64)  # vertex of each corner that is shared
     leaves = np.empty((len(indices), 6), np.int32)

@@ -1,9 +1,9 @@
-"""Triangles of a panorama with depth: few where it is flat, one pixel at depth edges.
+"""Triangle mesh of a panorama with depth: large triangles on planes, single pixels at depth edges.
 
-A page renders the virtual space from these. Vertices lie on the lattice of the pixels' corners. The surface is a
-right-triangulated irregular network (Evans, Kirkpatrick and Townsend, 2001): without cracks, and refined until its
-inverse depth is right everywhere within a tolerance. A plane needs few triangles from whatever side it is seen, because
-a triangle of three points on it lies in it. A pixel at a depth edge is a square of its own, at its own depth.
+A page renders the virtual space from this mesh. Vertices lie on the lattice of the pixels' corners. The surface is a
+right-triangulated irregular network (Evans, Kirkpatrick and Townsend, 2001), which has no cracks and is refined until
+its inverse depth is correct within a tolerance. A plane needs few triangles, even if it is seen at a flat angle. At a
+depth edge, a pixel is a separate square at its own depth.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from instant_ic.geometry.projections import directions_at
 
 TOLERANCE = 0.004
-"""Largest error of the inverse depth, in 1/m: it moves a view from 0.5 m aside, 640 pixels wide, by 0.6 pixels."""
+"""Largest error of the inverse depth, in 1/m. It shifts a point by 0.6 pixels in a 640 pixel view from 0.5 m aside."""
 
 
 @dataclass(frozen=True)
@@ -29,7 +29,7 @@ class LayerMesh:
             of the panorama, row 0 its upper edge.
         inverse_depth: inverse depth of each vertex, 1/m along the ray, (N,) float32.
         triangles: indices of vertices, (T, 3) uint32, counter-clockwise as the panorama's camera sees them.
-        size: height and width of the panorama's depth, which the lattice belongs to.
+        size: height and width of the panorama's depth image.
     """
 
     corners: NDArray[np.uint16]
@@ -47,20 +47,20 @@ def layer_mesh(
     """Triangulate a panorama's surface.
 
     Args:
-        inverse_depth: in 1/m along the ray, > 0, (h, w), w = 2 h.
+        inverse_depth: inverse depth along the ray in 1/m, > 0, (h, w), w = 2 h.
         depth_edge: quads that cross a depth edge (``prior.edge_quads``), (h, w).
-        shown: (h, w) false where the layer has no surface.
+        shown: mask of the pixels on which the layer has a surface, (h, w).
         tolerance: largest error of the inverse depth, in 1/m.
 
     Raises:
-        ValueError: shapes that do not fit, or values that are not finite and positive.
+        ValueError: shapes do not match, or values are not finite and positive.
     """
     from instant_ic.vspace.layer_kernels import corner_values, count_triangles, lattice_errors, write_triangles
 
     height, width = inverse_depth.shape
     if width != 2 * height or height < 2 or depth_edge.shape != shown.shape or shown.shape != (height, width):
         raise ValueError(
-            f"inverse depth {inverse_depth.shape}, edges {depth_edge.shape} and mask {shown.shape} do not fit"
+            f"shapes of inverse depth {inverse_depth.shape}, edges {depth_edge.shape} and mask {shown.shape} differ"
         )
     if not (np.isfinite(inverse_depth).all() and (inverse_depth > 0).all()):
         raise ValueError("inverse depth must be finite and > 0")
@@ -72,7 +72,7 @@ def layer_mesh(
     torn[:-1] |= gone | left
     torn[1:] |= gone | left
     right = np.roll(torn, -1, 1)
-    alone = torn[:-1] | right[:-1] | torn[1:] | right[1:]  # pixels that are squares of their own
+    alone = torn[:-1] | right[:-1] | torn[1:] | right[1:]  # pixels that are separate squares
     corners = corner_values(inverse, torn)
     tile = int(np.gcd(height, width) & -np.gcd(height, width))  # the largest power of two that divides both
     errors = lattice_errors(corners, corner_directions(height, width), alone, tile)

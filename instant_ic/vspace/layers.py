@@ -1,6 +1,6 @@
-"""The virtual space as a stack of panoramic layers, which any renderer can show: encoding, and decoding to keyframes.
+"""The virtual space as panoramic layers that any renderer can show: encoding and decoding.
 
-Each keyframe gives two layers: the visible surfaces, in the camera's own image, and the hidden ones behind them.
+Each keyframe has two layers: the visible surfaces, with the camera's image, and the hidden surfaces behind them.
 ``VspaceLayer.msg`` describes the encoding.
 """
 
@@ -24,14 +24,14 @@ _QUALITY = 90
 
 
 class Kind(enum.IntEnum):
-    """Numbers as in VspaceLayer.msg."""
+    """Kind of a layer, numbered as in VspaceLayer.msg."""
 
     SEEN = 0
     BEHIND = 1
 
 
 class Content(enum.IntEnum):
-    """Content of a pixel (``SEEN``) or of a quad (``BEHIND``); numbers as in VspaceLayer.msg."""
+    """Content of a pixel (layer ``SEEN``) or of a quad (layer ``BEHIND``), numbered as in VspaceLayer.msg."""
 
     NOTHING = 0
     SKY = 1
@@ -45,12 +45,12 @@ _SURE, _FILLED = 15, 8
 
 
 class LayersError(ValueError):
-    """Layers that cannot be decoded; the message says which and why."""
+    """Layers cannot be decoded; the message says which and why."""
 
 
 @dataclass(frozen=True)
 class Layer:
-    """One panorama with depth, encoded; fields as in VspaceLayer.msg, whose ``pose`` is ``map_from_camera`` (4, 4)."""
+    """An encoded panorama with depth; fields as in VspaceLayer.msg, where the pose is called ``pose``."""
 
     kind: Kind
     keyframe_id: int
@@ -77,8 +77,8 @@ def encode(keyframe: Keyframe, number: int, image: bytes | None, version: int) -
 
     Args:
         keyframe: the keyframe, prepared for rendering by the warp.
-        number: its id.
-        image: the camera's encoded panorama; None to encode it here.
+        number: id of the keyframe.
+        image: encoded panorama from the camera; None to encode the keyframe's.
         version: number of this version of the space.
     """
     prior, background = keyframe.prior, keyframe.background
@@ -113,7 +113,7 @@ def _marks(keyframe: Keyframe) -> NDArray[np.uint8]:
 
 
 def _encoded_geometry(inverse_depth: Floats, marks: NDArray[np.uint8]) -> tuple[float, bytes]:
-    """Return the depth in metres of the highest code, and the PNG."""
+    """Return the depth in metres that the highest code stands for, and the PNG."""
     most = float(inverse_depth.max())
     code = np.maximum(np.rint(inverse_depth * np.float32(_CODES / most)), 1).astype(np.uint16)
     image = np.dstack([marks, (code & 255).astype(np.uint8), (code >> 8).astype(np.uint8)])  # OpenCV writes BGR
@@ -130,11 +130,11 @@ class DecodedLayer:
     """Arrays of a layer.
 
     Attributes:
-        rgb: (H, 2 H, 3) uint8.
+        rgb: colours, (H, 2 H, 3) uint8.
         inverse_depth: 1/m along the ray, (h, 2 h) float32.
-        content: ``Content`` of each pixel, or of the quad right of and below it (``BEHIND``), (h, 2 h) uint8.
-        confidence: 0 to 1, (h, 2 h) float32; below 1 the depth was filled. Of hidden surfaces: their opacity.
-        edge: pixels whose quad, right of and below them, crosses a depth edge, (h, 2 h).
+        content: ``Content`` of each pixel, or in ``BEHIND`` of the quad to its lower right, (h, 2 h) uint8.
+        confidence: 0 to 1, (h, 2 h) float32; below 1 if the depth was filled. In ``BEHIND`` the surface's opacity.
+        edge: mask of the pixels whose quad to the lower right crosses a depth edge, (h, 2 h).
     """
 
     rgb: NDArray[np.uint8]
@@ -148,7 +148,7 @@ def decode_layer(layer: Layer) -> DecodedLayer:
     """Decode the arrays of a whole layer.
 
     Raises:
-        LayersError: an image cannot be decoded, or is no panorama.
+        LayersError: an image cannot be decoded, or is not a panorama.
     """
     name = f"layer {layer.kind.name} of keyframe {layer.keyframe_id}"
     colour = decode_image(layer.colour, cv2.IMREAD_COLOR) if layer.colour else None

@@ -12,7 +12,7 @@ from instant_ic.vspace.nerf.kernels import _OPTIONS
 
 @njit(**_OPTIONS)
 def _add_bilinear(texels, start, height, width, u, v, weight, rgb):  # type: ignore[no-untyped-def]
-    """Add ``weight`` × the bilinear colour at (u, v) in repeats of the image."""
+    """Add ``weight`` × the bilinear colour at (u, v) of the repeated image to ``rgb``."""
     x, y = (u - math.floor(u)) * width - 0.5, (v - math.floor(v)) * height - 0.5
     x0, y0 = math.floor(x), math.floor(y)
     fx, fy = x - x0, y - y0
@@ -30,15 +30,15 @@ def shade(  # type: ignore[no-untyped-def]
     triangles, corner_uv, corner_rgb, texture, texel_per_m, texels, start, sizes, levels,
     origin, directions, range_m, face, pixel_rad, colour
 ):  # fmt: skip
-    """Shade the hits of rays by the texture (trilinear, by the pixel's footprint) or the corners' colours.
+    """Shade the hits of rays with the texture, filtered over the pixel's footprint, or with the corners' colours.
 
     Args:
-        triangles ... texture: as in ``ColouredMesh``; texel_per_m ... levels: as in ``texel_pyramids``.
-        origin: origin of the rays, (3,).
-        directions: their directions, (P, 3).
-        range_m, face: distance and triangle of each hit, (P,); face −1 without one.
-        pixel_rad: angle of a pixel.
-        colour: out, (P, 3) in 0..1; 0 where nothing is met.
+        triangles, corner_uv, corner_rgb, texture: as in ``ColouredMesh``.
+        texel_per_m, texels, start, sizes, levels: as in ``texel_pyramids``.
+        origin, directions: origin of the rays, (3,), and their directions, (P, 3).
+        range_m, face: distance and triangle of each hit, (P,); face is −1 if a ray hits nothing.
+        pixel_rad: angle of a pixel in radians.
+        colour: RGB, 0 to 1, (P, 3); written; 0 if a ray hits nothing.
     """
     rgb = np.zeros(3, np.float64)
     for n in range(face.shape[0]):
@@ -53,8 +53,8 @@ def shade(  # type: ignore[no-untyped-def]
         py = origin[1] + range_m[n] * directions[n, 1] - t[0, 1]
         pz = origin[2] + range_m[n] * directions[n, 2] - t[0, 2]
         nx, ny, nz = ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
-        area = math.sqrt(nx * nx + ny * ny + nz * nz)  # twice the triangle's
-        # Shares of the corners: areas of the triangles with the point in place of each.
+        area = math.sqrt(nx * nx + ny * ny + nz * nz)  # twice the area of the triangle
+        # Barycentric weights: areas of the triangles in which the hit replaces one corner.
         w1 = ((py * bz - pz * by) * nx + (pz * bx - px * bz) * ny + (px * by - py * bx) * nz) / (area * area)
         w2 = ((ay * pz - az * py) * nx + (az * px - ax * pz) * ny + (ax * py - ay * px) * nz) / (area * area)
         w1 = min(max(w1, 0.0), 1.0)
@@ -69,7 +69,7 @@ def shade(  # type: ignore[no-untyped-def]
             u = w0 * corner_uv[f, 0, 0] + w1 * corner_uv[f, 1, 0] + w2 * corner_uv[f, 2, 0]
             v = w0 * corner_uv[f, 0, 1] + w1 * corner_uv[f, 1, 1] + w2 * corner_uv[f, 2, 1]
             facing = abs(nx * directions[n, 0] + ny * directions[n, 1] + nz * directions[n, 2]) / area
-            # Geometric mean of the footprint's two sides: less blur on slanted floors than by the longer.
+            # The geometric mean of the footprint's two sides blurs slanted floors less than the longer side would.
             footprint = pixel_rad * range_m[n] / math.sqrt(max(facing, 0.05))
             level = math.log2(max(texel_per_m[f] * footprint, 1.0))
             level = min(level, levels[picture] - 1.0)

@@ -1,7 +1,7 @@
-"""Conventional illusory control: renders a place that was scanned beforehand (paper, section II).
+"""Conventional illusory control, which renders a place that was scanned beforehand (paper, section II).
 
-The same calls as ``VirtualSpace``, but nothing is trained: READY at once. A keyframe only measures how similar mesh and
-camera image are, and sets the factors of the mesh's colours.
+``MeshSpace`` has the methods of ``VirtualSpace``, but it is not trained and READY at once. A keyframe is only compared
+with the mesh, to adjust the mesh's colours and to warn if the mesh lies in the wrong place.
 """
 
 from __future__ import annotations
@@ -25,21 +25,22 @@ from instant_ic.vspace.texel_pyramids import TexelPyramids, texel_density
 from instant_ic.vspace.view import RayRenderer, View, continue_unseen, equirect_rays, to_8bit
 
 EDGE_RATIO = 0.03
-"""Neighbouring depths that differ by more than this share are an edge; its pixels are rendered by four rays."""
+"""Relative difference of neighbouring depths above which there is an edge; its pixels are rendered with four rays."""
 _SUBPIXELS = ((-0.375, -0.125), (-0.125, 0.375), (0.125, -0.375), (0.375, 0.125))
 _PROBE_WIDTH = 256
-"""Width of the panoramas in which mesh and camera are compared."""
+"""Width in pixels of the panoramas in which mesh and camera are compared."""
 _MIN_SAMPLES = 200
 _MAX_GAIN = 3.0
 _NEAR, _LEAST_NEAR = 0.25, 0.7
-"""Depths that differ by less than this share agree; a mesh of which less than this agrees does not lie where it should.
-In small_house.glb, with depth 10 % off, 1 m aside or 20° turned gave 0.43 to 0.80, in its place 0.98 and more."""
+"""Largest relative difference of two depths that agree, and smallest share of agreeing depths in a mesh well placed.
+With small_house.glb and depth 10 % off, a mesh in its place had 0.98 or more; 1 m aside or turned by 20°, 0.43 to 0.80.
+"""
 _ASIDE = math.sin(math.radians(22.5))
-"""Floor and ceiling agree wherever the mesh lies: directions flatter than this count."""
+"""Sine of the elevation up to which depths are compared, because floor and ceiling agree wherever the mesh lies."""
 
 
 class MeshSpace(RayRenderer):
-    """A mesh in the map, rendered by ray casting. One thread at a time.
+    """A mesh in the map, rendered by ray casting; not thread-safe.
 
     Raises:
         MeshError: the file cannot be used; the message says why.
@@ -50,7 +51,7 @@ class MeshSpace(RayRenderer):
     """
 
     keyframe = None
-    """Views do not come from keyframes."""
+    """Keyframe of the views, which a mesh does not have."""
     dissolving = False
 
     def __init__(self, config: VirtualSpaceConfig) -> None:
@@ -64,12 +65,12 @@ class MeshSpace(RayRenderer):
             corners = np.arange(3 * len(triangles), dtype=np.int32).reshape(-1, 3)
             self._caster = RayCaster(triangles.reshape(-1, 3), corners)
         except ImportError as error:
-            raise MeshError("a mesh as the virtual space needs the package embreex: pip install it") from error
+            raise MeshError("a mesh as the virtual space needs the package embreex: pip install embreex") from error
         self._gain = np.ones(3, np.float32)
         self._mse = math.nan
         self._variance = 0.0
         self._warning = ""
-        self.render(np.eye(4), 32, 16, 1.0)  # kernels are compiled now, not at the operator's first image
+        self.render(np.eye(4), 32, 16, 1.0)  # compile the kernels now, not at the operator's first view
 
     def set_keyframe(
         self,
@@ -78,12 +79,12 @@ class MeshSpace(RayRenderer):
         map_from_camera: NDArray[np.floating],
         relative_sigma: float | NDArray[np.floating],
     ) -> None:
-        """Compare the mesh with a panorama; with ``mesh_fit_colours``, fit one colour factor a channel.
+        """Compare the mesh with a panorama; with ``mesh_fit_colours``, fit one factor per colour channel.
 
         Args: as ``prior.prepare``; ``relative_sigma`` is not used.
 
         Raises:
-            KeyframeError: no panorama, or a pose that is none; all stays as it was.
+            KeyframeError: the panorama or the pose is invalid. The space does not change.
         """
         check_panorama(rgb)
         check_pose(map_from_camera)
@@ -98,7 +99,7 @@ class MeshSpace(RayRenderer):
         met = range_m > 0
         if self.config.mesh_fit_colours:
             self._fit_colours(theirs[met], ours[met])
-        weight = np.sqrt(np.clip(1 - rays.directions[:, 2] ** 2, 0, 1))  # a panorama's rows by solid angle
+        weight = np.sqrt(np.clip(1 - rays.directions[:, 2] ** 2, 0, 1))  # solid angle of a panorama's pixels
         if met.any():
             squared = np.mean((np.clip(ours[met] * self._gain, 0, 1) - theirs[met]) ** 2, axis=1)
             self._mse = float(np.average(squared, weights=weight[met]))
@@ -109,7 +110,7 @@ class MeshSpace(RayRenderer):
         self._check_place(depth_m, range_m, aside, width)
 
     def _fit_colours(self, theirs: Floats, ours: Floats) -> None:
-        """Fit the factors of the mesh's colours by medians; later keyframes change them half the way."""
+        """Fit the factors of the mesh's colours by medians. Later keyframes change them by half of the difference."""
         usable = np.all((theirs > 0.05) & (theirs < 0.95) & (ours > 0.05) & (ours < 0.95), axis=1)
         if np.count_nonzero(usable) < _MIN_SAMPLES:
             return
@@ -125,25 +126,25 @@ class MeshSpace(RayRenderer):
         known = aside & np.isfinite(depth) & (depth > 0)
         self._warning = ""
         if known.any():
-            ratio = range_m[known] / depth[known]  # 0 where nothing is met
+            ratio = range_m[known] / depth[known]  # 0 if the ray hits nothing
             agrees = float(np.mean((ratio > 1 - _NEAR) & (ratio < 1 / (1 - _NEAR))))
             if agrees < _LEAST_NEAR:
                 self._warning = (
-                    f"only {agrees:.0%} of the mesh round the newest keyframe lies where the measured depth says;"
-                    " is space.mesh_pose right?"
+                    f"only {agrees:.0%} of the mesh agrees with the depth measured at the newest keyframe;"
+                    " check space.mesh_pose"
                 )
 
     def train(self, budget_ms: float = math.inf, iterations: int | None = None) -> None:
-        """Do nothing: there is nothing to train."""
+        """Do nothing, because a mesh is not trained."""
 
     @property
     def status(self) -> SpaceStatus:
-        """READY at once; ``psnr_db`` compares the mesh with the newest keyframe's image and is NaN before the first."""
+        """The status, READY at once; ``psnr_db`` compares mesh and newest keyframe and is NaN before the first."""
         corners = self._mesh.triangles.reshape(-1, 3)
         return SpaceStatus(
             state=SpaceState.READY,
             psnr_db=psnr_of_mse(self._mse),
-            ready_radius_m=float(np.linalg.norm(np.ptp(corners, axis=0))),  # from any place in it to any other
+            ready_radius_m=float(np.linalg.norm(np.ptp(corners, axis=0))),  # diagonal of the mesh's bounding box
             converged=True,
             source="mesh",
             device="cpu (embree)",
@@ -160,14 +161,14 @@ class MeshSpace(RayRenderer):
         return View(to_8bit(image), depth, confidence, projection, psnr_of_mse(mse))
 
     def _render_rays(self, rays: Rays) -> tuple[Floats, Floats, Floats]:
-        """Render rays; return colours (P, 3), 0 to 1, range (P,), 0 where nothing is met, and confidence (P,)."""
+        """Render rays; return colours (P, 3), 0 to 1, range (P,), 0 if a ray hits nothing, and confidence (P,)."""
         height, width = rays.shape
         turn = self._map_from_mesh[:3, :3].astype(np.float32)
         origin = ((rays.origin - self._map_from_mesh[:3, 3]) @ self._map_from_mesh[:3, :3]).astype(np.float32)
         directions = np.einsum("pj,ji->pi", rays.directions, turn)
         grid = directions.reshape(height, width, 3)
         across, down = (np.gradient(grid, axis=axis) for axis in (1, 0))
-        if width > 2 * height - 1:  # a panorama's first column has its left neighbour at the other edge
+        if width > 2 * height - 1:  # a panorama: the first column's left neighbour is the last column
             across[:, 0] = across[:, 1]
             across[:, -1] = across[:, -2]
         pixel_rad = float(np.linalg.norm(down[height // 2, width // 2]))
@@ -218,11 +219,15 @@ Space: TypeAlias = VirtualSpace | MeshSpace
 
 
 def make_space(config: VirtualSpaceConfig | None = None, robot: NDArray[np.bool_] | None = None) -> Space:
-    """Create the space for ``config.source``; ``robot``: the robot's mask, as ``VirtualSpace`` takes it.
+    """Create the space for ``config.source``.
+
+    Args:
+        config: parameters of the space.
+        robot: mask of the robot, see ``VirtualSpace``.
 
     Raises:
         MeshError: ``source`` is ``mesh``, and its file cannot be used.
-        DeviceError: the device that was asked for is not there.
+        DeviceError: the requested device is absent or does not work.
     """
     config = config or VirtualSpaceConfig()
     return MeshSpace(config) if config.source == "mesh" else VirtualSpace(config, robot)

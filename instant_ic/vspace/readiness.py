@@ -1,11 +1,11 @@
 """Expected PSNR of a view, without its ground truth.
 
-Three things make the image on the operator's page differ from the truth: the page itself (size of the view, JPEG,
-magnification), the depth's error, which moves surfaces aside, and places that have not been seen at all. The cost of a
-shift is read off the panorama: the mean squared difference between it and itself turned by that angle. The gains are
-fitted to live frames (``benchmarks/readiness.py``). Tried without gain on other worlds: detail that near surfaces lack,
-the panorama's finest detail, the view's own detail, the share of filled depth, depth edges by parallax, and how well
-the warp renders older keyframes.
+The image on the operator's page differs from the truth for three reasons: the page itself (size of the view, JPEG,
+magnification), errors of the depth, which shift surfaces, and unseen parts. The cost of a shift is measured on the
+panorama, as the mean squared difference between the panorama and a copy rotated by that angle. The weights are fitted
+to live frames (``benchmarks/readiness.py``). The following did not improve the estimate on other worlds: missing detail
+of near surfaces, the panorama's finest detail, the view's own detail, the share of filled depth, depth edges weighted
+by parallax, and the warp's error on older keyframes.
 """
 
 from __future__ import annotations
@@ -24,13 +24,13 @@ from instant_ic.vspace.prior import PanoramaPrior, area_average
 _ROWS, _ROW_STEP = 512, 4
 _TURNS = np.array([1, 2, 3, 5, 8, 13, 21, 34, 55, 89, 144])
 BASE_MSE = 0.6e-3
-"""Error of a view at the keyframe's own pose, as the page shows it."""
+"""Mean squared error of a view at the keyframe's pose, as shown on the page."""
 SHIFT_GAIN, UNSEEN_GAIN = 1.0, 1.65
 
 
 @dataclass(frozen=True)
 class Texture:
-    """``mse[i]``: mean squared difference (0..1 units) between a panorama and itself turned by ``angle_rad[i]``."""
+    """A panorama's texture: mean squared difference ``mse[i]`` (0 to 1) to a copy rotated by ``angle_rad[i]``."""
 
     angle_rad: Floats
     mse: Floats
@@ -38,7 +38,7 @@ class Texture:
 
     @classmethod
     def of(cls, rgb: NDArray[np.uint8]) -> Texture:
-        """Measure a panorama (H, 2 H, 3), in its middle third, where a turn moves pixels by its own angle."""
+        """Measure the middle third of a panorama (H, 2 H, 3), where a rotation shifts pixels by nearly its angle."""
         height, whole = min(_ROWS, rgb.shape[0]), rgb.shape[0]
         band = rgb[whole // 3 : whole - whole // 3]
         averaged = area_average(band, max(1, round(len(band) * height / whole)), 2 * height)
@@ -48,17 +48,17 @@ class Texture:
         return cls(angles.astype(np.float32), np.array([0.0, *mse], np.float32), float(small.var(axis=(0, 1)).mean()))
 
     def cost(self, angle_rad: Floats) -> Floats:
-        """Return the expected squared difference at shifts in radians."""
+        """Return the expected mean squared difference for shifts in radians."""
         return np.interp(angle_rad, self.angle_rad, self.mse).astype(np.float32)
 
 
 def error_terms(
     prior: PanoramaPrior, texture: Texture, rays: Rays, depth: Floats, confidence: Floats
 ) -> tuple[float, float]:
-    """Return the squared errors (0 to 1 units) of a view from shifts and from unseen parts, before weighting.
+    """Return the squared errors (colours 0 to 1) of a view from shifts and from unseen parts, before weighting.
 
     Args:
-        prior: keyframe that the view is rendered from, with each pixel's sigma.
+        prior: keyframe from which the view is rendered.
         texture: texture of its panorama.
         rays: P rays of the view.
         depth: metres along the rays as rendered, (P,).
@@ -81,7 +81,7 @@ def error_terms(
 
 
 def expected_psnr_db(terms: tuple[float, float], training_psnr_db: float, panorama_share: float) -> float:
-    """Return the PSNR on the page from ``error_terms``; the field's parts have at least its training error."""
+    """Return the PSNR on the page for ``error_terms``. Parts shown by the field have at least its training error."""
     shift, unseen = terms
     training = 0.0 if panorama_share == 1 else (1 - panorama_share) * 10 ** (-training_psnr_db / 10)
     mse = BASE_MSE + SHIFT_GAIN * shift + UNSEEN_GAIN * unseen + training

@@ -1,4 +1,4 @@
-"""A trained virtual space as one ``.npz`` file: configuration, keyframes, the field's parameters, and its progress."""
+"""Storage of a trained virtual space in one ``.npz`` file: configuration, keyframes, field and training progress."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ Arrays = dict[str, NDArray[Any]]
 
 
 class SpaceFileError(ValueError):
-    """A file holds no usable space; the message names the file and the reason."""
+    """A file contains no usable space; the message names the file and the reason."""
 
 
 @dataclass(frozen=True)
 class TrainingProgress:
-    """Progress of training, with ``VirtualSpace``'s own fields."""
+    """Progress of training, in the state variables of ``VirtualSpace``."""
 
     psnr_db: float
     iteration: int
@@ -47,10 +47,10 @@ class SavedSpace:
     Attributes:
         config: parameters of the space.
         priors: the keyframes, newest first.
-        gains: factors that bring their colours to the newest's exposure, (K, 3).
+        gains: factors that bring each keyframe's colours to the newest's exposure, (K, 3).
         lattice: lattice of the field.
         parameters: the trained field.
-        progress: progress of its training.
+        progress: progress of training.
     """
 
     config: VirtualSpaceConfig
@@ -62,7 +62,7 @@ class SavedSpace:
 
 
 def space_file(path: str | Path) -> Path:
-    """Return the file of a space, which ``path`` names directly or by its folder."""
+    """Return the file of a space for a path to the file or to its folder."""
     path = Path(path)
     return path if path.suffix == ".npz" and not path.is_dir() else path / FILE_NAME
 
@@ -75,7 +75,7 @@ def write(path: str | Path, saved: SavedSpace) -> Path:
         saved: content of the file.
 
     Raises:
-        OSError: it cannot be written.
+        OSError: the file cannot be written.
     """
     file, arrays = space_file(path), {"format": np.asarray(FORMAT)}
     _flatten("", saved, arrays)
@@ -86,13 +86,13 @@ def write(path: str | Path, saved: SavedSpace) -> Path:
 
 
 def read(path: str | Path) -> SavedSpace:
-    """Read a file that ``write`` has made.
+    """Read a file written by ``write``.
 
     Args:
         path: the file, or its folder.
 
     Raises:
-        SpaceFileError: missing, damaged, foreign, or of another version.
+        SpaceFileError: the file is missing, damaged, not a space, or of another version.
     """
     file = space_file(path)
     try:
@@ -116,7 +116,7 @@ def read(path: str | Path) -> SavedSpace:
 
 
 def _flatten(name: str, value: Any, arrays: Arrays) -> None:
-    """Enter a dataclass, field by field, and tuples of dataclasses into ``arrays``, by dotted names."""
+    """Store a value in ``arrays`` under dotted names; dataclasses and tuples of them are stored field by field."""
     if dataclasses.is_dataclass(value):
         for field in dataclasses.fields(value):
             _flatten(f"{name}.{field.name}", getattr(value, field.name), arrays)

@@ -1,4 +1,4 @@
-"""The virtual space: keyframes' panoramas and depth, shown by warping and learnt by a field (paper, IV.A-B)."""
+"""The virtual space: keyframes with depth, shown by warping and learnt by a field (paper, IV.A-B)."""
 
 from __future__ import annotations
 
@@ -30,15 +30,15 @@ from instant_ic.vspace.view import RayRenderer, View, to_8bit
 
 T = TypeVar("T")
 PROBE_COLUMNS = 64
-"""Columns of the pixels of a view by which its quality is estimated."""
+"""Number of columns of the grid of pixels on which a view's quality is estimated."""
 PARALLAX_RAD = 0.035
-"""Displacement of surfaces by the depth's error up to which views are fit to show."""
+"""Largest displacement of surfaces by errors of the depth in a view that may be shown."""
 LEAST_DEPTH_SHARE = 0.5
-"""Smallest weight of the keyframe's depth in where the field's surfaces lie."""
+"""Smallest weight of the keyframes' depth in the position of the field's surfaces."""
 
 
 class SpaceState(enum.IntEnum):
-    """State of a space; numbers as in VspaceStatus.msg."""
+    """State of a space, numbered as in VspaceStatus.msg."""
 
     EMPTY = 0
     TRAINING = 1
@@ -52,19 +52,19 @@ class SpaceStatus:
 
     Attributes:
         state: state of the space.
-        refreshing: the field has not learnt the newest keyframe yet.
+        refreshing: True while the field has not learnt the newest keyframe yet.
         psnr_db: PSNR of the training rays since the newest keyframe.
         iterations: iterations since the newest keyframe.
         train_seconds: training time since the newest keyframe.
-        ready_iterations: iterations from the keyframe until READY, 0 while not ready.
+        ready_iterations: iterations from the keyframe until READY; 0 while not ready.
         ms_per_iteration: mean time of an iteration.
         ready_radius_m: distance from the keyframe up to which views may be shown.
-        converged: nothing is left to train.
+        converged: True if nothing is left to train.
         source: source of the views: ``field``, ``warp`` or ``mesh``.
         device: name of the backend.
-        warning: problem of the device; empty when there is none.
-        shows_field: views show the field and not the warp.
-        gain_db: PSNR of the field above the warp's on older keyframes; NaN where it was not measured.
+        warning: problem of the device; empty if there is none.
+        shows_field: True if views show the field and not the warp.
+        gain_db: PSNR of the field minus that of the warp on older keyframes; NaN if it was not measured.
     """
 
     state: SpaceState
@@ -92,8 +92,8 @@ class TrainingRun:
 
     Args:
         config: parameters of the space.
-        refresh: the field starts from its present parameters.
-        colour_error: squared colour error so far; NaN before the first iteration.
+        refresh: True if the field starts from its present parameters.
+        colour_error: smoothed squared colour error so far; NaN before the first iteration.
     """
 
     def __init__(self, config: VirtualSpaceConfig, refresh: bool, colour_error: float = math.nan) -> None:
@@ -109,11 +109,11 @@ class TrainingRun:
         return psnr_of_mse(self.colour_error)
 
     def note(self, colour_error: float, done: bool) -> bool:
-        """Note the error of an iteration; return True if the space has become fit to show.
+        """Record the error of an iteration; return True if the space has just become ready.
 
         Args:
-            colour_error: mean squared colour error, 0 to 1 units.
-            done: nothing is left to train.
+            colour_error: mean squared colour error, colours 0 to 1.
+            done: True if nothing is left to train.
         """
         first = math.isnan(self.colour_error)
         self.colour_error = colour_error if first else 0.9 * self.colour_error + 0.1 * colour_error
@@ -130,14 +130,14 @@ class TrainingRun:
 class VirtualSpace(RayRenderer):
     """The newest keyframes, shown at once by warping, and one hash-grid field trained on all of them.
 
-    A new keyframe is shown from the moment it is taken; the field goes on from its present parameters. One thread at a
-    time. The same calls with the same seed give the same bits on the CPU, if training is limited by iterations.
+    A new keyframe is shown as soon as it is prepared. The field continues from its present parameters. On the CPU, the
+    same calls with the same seed give the same bits, if training is limited by iterations. Not thread-safe.
 
     Attributes:
         config: parameters.
         device: backend of the field.
         scene: scene that the field learns; None before the first.
-        trials: views of older keyframes by which field and warp are compared.
+        trials: views of older keyframes on which field and warp are compared.
         choice: choice between field and warp.
 
     Example:
@@ -152,23 +152,24 @@ class VirtualSpace(RayRenderer):
 
         Args:
             config: parameters.
-            robot: mask, (H, 2 H), True where panoramas show the robot itself or its stand; pixels below
+            robot: mask of the robot itself or its stand in panoramas, (H, 2 H); pixels below
                 ``config.geometry.body_below_deg`` are added.
 
         Raises:
-            ValueError: parameters that do not fit; DeviceError: a device that is not there.
+            ValueError: ``config.source`` is ``mesh``.
+            DeviceError: the requested device is absent or does not work.
         """
         self.config = config or VirtualSpaceConfig()
         if self.config.source == "mesh":
-            raise ValueError("source is mesh: nothing is learnt there; use make_space, which renders the mesh")
+            raise ValueError("source is mesh, which VirtualSpace cannot render; use make_space")
         self._robot = robot
         self.device, self._warning = make_device(self.config)
         if self.config.source == "auto":
             source = "field" if self.device.on_gpu else "warp"
             self.config = dataclasses.replace(self.config, source=source)
         self._shown: KeyframeSet | None = None
-        self._before: KeyframeSet | None = None  # shown before, until the newest has taken over
-        self._views = 0  # rendered since then
+        self._before: KeyframeSet | None = None  # previous keyframes, until the dissolve to the newest is over
+        self._views = 0  # views rendered since the dissolve began
         self.scene: TrainingScene | None = None
         self.trials: tuple[WarpTrial, ...] = ()
         self.choice = Choice(self.config.view.field_gain_db)
@@ -193,12 +194,12 @@ class VirtualSpace(RayRenderer):
 
     @property
     def dissolving(self) -> bool:
-        """True while the next views still change, from the keyframe before into the newest."""
+        """True while views change from the previous keyframe to the newest."""
         return self._before is not None
 
     @property
     def _done(self) -> bool:
-        """True if nothing is left to train, or it would not help."""
+        """True if nothing is left to train, or if more training would not help."""
         return self._run.schedule.finished or self.choice.hopeless or self.config.source == "warp"
 
     def set_keyframe(
@@ -213,7 +214,7 @@ class VirtualSpace(RayRenderer):
         Args: as ``prior.prepare``.
 
         Raises:
-            KeyframeError: the keyframe cannot be used; the old space stays as it was.
+            KeyframeError: the keyframe cannot be used. The space does not change.
         """
         prepared = self.prepare(rgb, depth_m, map_from_camera, relative_sigma)
         if self.config.source == "field":
@@ -227,10 +228,10 @@ class VirtualSpace(RayRenderer):
         map_from_camera: NDArray[np.floating],
         relative_sigma: float | NDArray[np.floating],
     ) -> KeyframeSet:
-        """Prepare a new keyframe, with the earlier ones that are kept; changes nothing that is shown.
+        """Prepare a new keyframe together with earlier ones, without changing what is shown.
 
-        The field learns from ``config.keyframes`` − 1 earlier keyframes too, in the new one's exposure and without
-        moved objects. ``config.older`` keyframes give their pixels of places hidden from the new one. Keyframes of
+        The field also learns from ``config.keyframes`` − 1 earlier keyframes, in the new one's exposure and without
+        moved objects. ``config.older`` keyframes contribute pixels of surfaces hidden from the new one. Keyframes of
         another size are dropped.
 
         Args: as ``prior.prepare``.
@@ -248,13 +249,13 @@ class VirtualSpace(RayRenderer):
         """Show these keyframes from now on.
 
         Args:
-            prepared: keyframes of ``prepare``.
+            prepared: result of ``prepare``.
             dissolve: blend from the previous keyframe over the next ``view.refresh_views`` views.
         """
         self._before, self._views = self._shown if dissolve else None, 0
         self._shown = prepared
         if self.config.source == "warp":
-            self._ready, self._run.ready_iterations = True, 1  # a warp is ready at once
+            self._ready, self._run.ready_iterations = True, 1  # the warp is ready at once
         self._end_dissolve()
 
     def _end_dissolve(self) -> None:
@@ -264,7 +265,8 @@ class VirtualSpace(RayRenderer):
     def learn(self, shown: KeyframeSet) -> None:
         """Train on these keyframes from now on, starting from the present parameters.
 
-        Where the scale has changed by more than a factor of 2 it starts again. A failing device leaves the old space.
+        If the scale has changed by more than a factor of 2, training starts from new parameters. If the device fails,
+        the old space remains.
         """
         priors, old = shown.priors, self.scene
         lattice = Lattice.for_prior(priors[0], self.config.field)
@@ -284,13 +286,13 @@ class VirtualSpace(RayRenderer):
         self.scene, self.trials = scene, ()
         self._ready = self._ready and (refresh or not self.config.view.field_alone)
         self._run = TrainingRun(self.config, refresh, self._run.colour_error if refresh else math.nan)
-        self.choice.gain_db = math.nan  # on other images
+        self.choice.gain_db = math.nan  # the old gain was measured on other images
 
     def train(self, budget_ms: float = math.inf, iterations: int | None = None) -> None:
-        """Train for a time, a number of iterations or to the end of the schedule; at least one iteration.
+        """Train until a time, a number of iterations or the schedule is over, for at least one iteration.
 
         Raises:
-            NotReadyError: no keyframe yet.
+            NotReadyError: there is no keyframe yet.
         """
         if self._shown is None:
             raise NotReadyError("no keyframe yet: call set_keyframe first")
@@ -345,14 +347,14 @@ class VirtualSpace(RayRenderer):
         )
 
     def _ready_radius_m(self) -> float:
-        """Return the distance b at which surfaces at the median depth D move by ``PARALLAX_RAD``, about b·σ/D."""
+        """Return the distance b at which surfaces at the median depth D shift by ``PARALLAX_RAD``, about b·σ/D."""
         prior = self.keyframe
         assert prior is not None
         sigma = max(prior.relative_sigma, 1e-3)
         return min(self.config.readiness.max_radius_m, PARALLAX_RAD * prior.median_depth_m / sigma)
 
     def _expected(self, rays: Rays, view: ComposedView) -> float:
-        """Return the expected PSNR of a view as it was rendered, from a few thousand of its pixels."""
+        """Return the expected PSNR of a rendered view, estimated from a few thousand of its pixels."""
         assert self._shown is not None
         step = max(1, rays.shape[1] // PROBE_COLUMNS)
         height, width = rays.shape
@@ -378,30 +380,30 @@ class VirtualSpace(RayRenderer):
         return View(to_8bit(image), depth, confidence, projection, self._expected(rays, view))
 
     def _learn_what_is_rendered(self, around: bool) -> None:
-        """Train on the shown keyframes if the field is rendered too and has no scene yet."""
+        """Set the shown keyframes as the field's scene if a view needs the field and it has no scene yet."""
         if self.scene is None and (self._panorama_share < 1 or around):
             assert self._shown is not None
             self.learn(self._shown)
 
     def _composed(self, rays: Rays, shown: KeyframeSet, around: bool) -> ComposedView:
-        """Render a keyframe: its panorama warped, or the field; a panorama ``around`` is not warped."""
+        """Render the warped keyframe or the field. A panorama (``around``) is rendered by the field."""
         share, field = self._panorama_share, None
         if share == 0 or around:
             field = self._render_field(rays, share)
         return compose(rays, None if around else shown.newest, field)
 
     def _render_field(self, rays: Rays, share: float) -> Rendering:
-        """Render the field, with the weight ``share`` of the panorama's colours."""
+        """Render the field, in which the panorama's colours have the weight ``share``."""
         return self._on_device(lambda device: device.render_rays(rays, share, max(share, LEAST_DEPTH_SHARE)))
 
     def _on_device(self, work: Callable[[Device], T]) -> T:
-        """Use the device; with ``device: auto``, the CPU continues for a GPU that is out of memory."""
+        """Use the device. If a GPU is out of memory and ``device`` is ``auto``, continue on the CPU."""
         try:
             return work(self.device)
         except RuntimeError as error:
             if not is_out_of_memory(error) or self.config.device != "auto":
                 raise
-            self._warning = f"{self.device.name} is out of memory; on the CPU from now on ({error})"
+            self._warning = f"{self.device.name} is out of memory; the CPU is used from now on ({error})"
         parameters, self.device = self.device.parameters(), cpu_device(self.config.field, self.config.train)
         self.device.load(parameters)
         if self.scene is not None:
@@ -410,7 +412,7 @@ class VirtualSpace(RayRenderer):
 
     @property
     def _panorama_share(self) -> float:
-        """Weight of the panorama's colours: 1 while the panorama is shown, 0 while the field is."""
+        """Weight of the panorama's colours: 1 while the panorama is shown, 0 while the field is shown."""
         if self.config.source == "warp":
             return 1.0
         return 0.0 if self.config.view.field_alone or self.choice.field else 1.0
@@ -429,19 +431,19 @@ class VirtualSpace(RayRenderer):
         )
 
     def save(self, path: str | Path) -> Path:
-        """Save the space that views show as one ``.npz`` file, and return the file.
+        """Save the shown space as one ``.npz`` file, and return the file.
+
+        The optimiser's moments are not saved. Training that continues from a file starts with new moments.
 
         Args:
             path: the file or its folder.
 
-        The optimiser's moments are not in it: training that goes on from a file starts them again.
-
         Raises:
-            NotReadyError: no keyframe yet.
-            OSError: the file cannot be written; an older one stays as it was.
+            NotReadyError: there is no keyframe yet.
+            OSError: the file cannot be written. An older file does not change.
         """
         if self._shown is None:
-            raise NotReadyError("no keyframe yet: there is nothing to save")
+            raise NotReadyError("no keyframe yet, so there is nothing to save")
         if self.scene is None:
             self.learn(self._shown)
         assert self.scene is not None
@@ -455,14 +457,14 @@ class VirtualSpace(RayRenderer):
 
     @classmethod
     def load(cls, path: str | Path, device: str | None = None) -> VirtualSpace:
-        """Load the space of a file or folder; on the CPU its views are bit-identical to those before saving.
+        """Load the space from a file or folder. On the CPU its views are bit-identical to those before saving.
 
         Args:
             path: the file or its folder.
-            device: value of ``VirtualSpaceConfig.device``; None for the file's own.
+            device: value of ``VirtualSpaceConfig.device``; None for the value in the file.
 
         Raises:
-            SpaceFileError: missing, damaged, foreign, or of a newer version.
+            SpaceFileError: the file is missing, damaged, not a space, or of another version.
         """
         saved = read(path)
         space = cls(saved.config if device is None else dataclasses.replace(saved.config, device=device))
@@ -477,6 +479,6 @@ class VirtualSpace(RayRenderer):
         run.seconds, run.ready_iterations = progress.train_seconds, progress.ready_iterations
         space._ready = progress.ready
         space.choice.field = progress.shows_field
-        # Rays that were not sampled before, the same at each loading.
+        # Rays differ from those before saving, but are the same each time the file is loaded.
         space._rng = np.random.default_rng((saved.config.train.seed, progress.iteration))
         return space

@@ -1,4 +1,4 @@
-"""Image pyramids of a mesh's textures, as the renderer takes them."""
+"""Image pyramids of a mesh's textures, as arrays for the renderer."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from instant_ic.vspace.nerf.field import Floats
 from instant_ic.vspace.prior import area_average
 
 MAX_LEVELS = 13
-"""Levels of an image pyramid: images up to 4096 pixels a side."""
+"""Largest number of levels of an image pyramid, for images of up to 4096 pixels per side."""
 
 
 @dataclass(frozen=True)
 class TexelPyramids:
-    """Each image at full, half, quarter... size, area-averaged.
+    """Image pyramids: each image at full, half, quarter and so on of its size, area-averaged.
 
     Attributes:
         texels: texels of all images and levels one after another, (N, 3) uint8.
@@ -52,9 +52,12 @@ class TexelPyramids:
 
 
 def texel_density(mesh: ColouredMesh) -> Floats:
-    """Return the texels (without an image: triangles) per metre, (T,), from the areas in the image and in the world."""
+    """Return each triangle's texels per metre, (T,), from its areas in image and world.
+
+    A triangle without an image counts as one texel.
+    """
     edges = mesh.corner_uv[:, 1:] - mesh.corner_uv[:, :1]
     in_uv = np.abs(edges[:, 0, 0] * edges[:, 1, 1] - edges[:, 0, 1] * edges[:, 1, 0]).astype(np.float64)
-    whole = np.array([*(image.shape[0] * image.shape[1] for image in mesh.images), 0.0])  # the last is of texture −1
+    whole = np.array([*(image.shape[0] * image.shape[1] for image in mesh.images), 0.0])  # the last is for texture −1
     twice_area = np.linalg.norm(doubled_areas(mesh.triangles), axis=1)
     return np.sqrt(np.where(mesh.texture < 0, 2, in_uv * whole[mesh.texture]) / twice_area).astype(np.float32)

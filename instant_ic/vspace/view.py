@@ -15,12 +15,12 @@ from instant_ic.vspace.nerf.field import Floats, Rays
 from instant_ic.vspace.prior import fill_holes
 
 MIN_VIEW, MAX_VIEW = 16, 4096
-"""Pixels a side."""
+"""Smallest and largest side of a view in pixels."""
 _SOFT, _SOFT_EDGE = 16, 7
-"""Width in pixels of the averages in estimated parts, and of the transition to them."""
+"""Width in pixels of the blur in estimated parts, and of the transition to them."""
 _GREY = np.array([0.30, 0.59, 0.11], np.float32)
 _STRIDE_RAD = 0.025
-"""In an equirect image the inverse depth of a plane is linear between pixels no further apart than about this."""
+"""Angle in an equirect image within which the inverse depth of a plane is approximately linear."""
 
 
 @dataclass(frozen=True)
@@ -29,9 +29,8 @@ class View:
 
     Attributes:
         rgb: image, (H, W, 3) uint8; unknown parts are filled from their surroundings.
-        depth_m: metres along each ray, (H, W); 0 where it meets nothing.
-        confidence: 1 where a keyframe has seen the place, 0.5 where it has but its depth was filled, 0 where the place
-            is unknown, (H, W).
+        depth_m: metres along each ray, (H, W); 0 where the ray hits nothing.
+        confidence: 1 on surfaces that a keyframe has seen, 0.5 where their depth was filled, 0 elsewhere, (H, W).
         projection: ``perspective`` or ``equirect``.
         expected_psnr_db: estimated PSNR of the image (``readiness``).
     """
@@ -44,12 +43,12 @@ class View:
 
     @property
     def unseen_share(self) -> float:
-        """Share of the pixels that no keyframe has seen, 0..1."""
+        """Share of the pixels that no keyframe has seen, 0 to 1."""
         return float(np.count_nonzero(self.confidence == 0)) / self.confidence.size
 
     @property
     def mean_confidence(self) -> float:
-        """Mean over the image; of an equirect image by solid angle."""
+        """Mean confidence over the image, weighted by solid angle in an equirect image."""
         if self.projection != "equirect":
             return float(self.confidence.mean())
         height = self.confidence.shape[0]
@@ -57,7 +56,7 @@ class View:
         return float(self.confidence.mean(axis=1) @ weight / weight.sum())
 
     def softened(self) -> NDArray[np.uint8]:
-        """Return the image as it is shown to people, (H, W, 3): blurred and paler where it is an estimate."""
+        """Return the image for people, (H, W, 3), in which estimated parts are blurred and paler."""
         import cv2
 
         if (self.confidence >= 1).all():
@@ -73,13 +72,13 @@ class View:
 
 
 def check_size(width: int, height: int) -> None:
-    """Check that a view is neither too small nor too large to render (else ValueError)."""
+    """Raise ValueError if a view is too small or too large to render."""
     if not (MIN_VIEW <= width <= MAX_VIEW and MIN_VIEW <= height <= MAX_VIEW):
-        raise ValueError(f"view must have {MIN_VIEW} to {MAX_VIEW} pixels a side (got {width} x {height})")
+        raise ValueError(f"view must have {MIN_VIEW} to {MAX_VIEW} pixels per side (got {width} x {height})")
 
 
 def checked_pose(map_from_camera: NDArray[np.floating]) -> NDArray[np.float64]:
-    """Return the pose as float64; ValueError if it is not a finite (4, 4) matrix."""
+    """Return the pose as float64. Raise ValueError if it is not a finite (4, 4) matrix."""
     pose = np.asarray(map_from_camera, np.float64)
     if pose.shape != (4, 4) or not np.isfinite(pose).all():
         raise ValueError("pose of the view must be a finite 4x4 matrix")
@@ -100,11 +99,11 @@ def _equirect(width: int, height: int) -> tuple[Floats, Floats]:
 
 
 class LensRays(Rays):
-    """Rays of a lens, turned into the map only where that is asked for: a GPU turns them itself.
+    """Rays of a lens that are rotated into the map on demand, because a GPU rotates them itself.
 
     Attributes:
-        lens: unit vectors of the camera's frame, (P, 3) in Fortran's order; the same array for all images of one size
-            and projection.
+        lens: unit vectors in the camera's frame, (P, 3) in Fortran order; images of one size and projection share the
+            array.
         turn: map_from_camera rotation, (3, 3) float32.
     """
 
@@ -113,7 +112,7 @@ class LensRays(Rays):
 
     def __init__(self, pose: NDArray[np.float64], lens: Floats, axial: Floats, shape: tuple[int, int], stride: int):
         turn, origin = pose[:3, :3].astype(np.float32), pose[:3, 3].astype(np.float32)
-        # Not by assignment: rays are frozen.
+        # Attributes of a frozen dataclass cannot be assigned.
         vars(self).update(origin=origin, axial=axial, shape=shape, stride=stride, lens=lens, turn=turn)
 
     @functools.cached_property
@@ -125,8 +124,8 @@ class LensRays(Rays):
 
 
 def _turned(directions: Floats, turn: Floats) -> Floats:
-    # Not by matmul: BLAS would start threads for it, which wait for each other ten times as long as they compute.
-    # Coordinate by coordinate, which einsum does four times as fast.
+    # einsum instead of matmul, because BLAS would start threads that wait ten times as long as they compute. With the
+    # coordinate as the first axis, einsum is four times as fast.
     return np.ascontiguousarray(np.einsum("jp,ij->ip", directions.T, turn).T)
 
 
@@ -143,16 +142,16 @@ def equirect_rays(pose: NDArray[np.float64], width: int) -> Rays:
 
 
 def continue_unseen(image: Floats, depth_m: Floats, confidence: Floats, wraps: bool = False) -> Floats:
-    """Fill unknown pixels from their surroundings, mostly from the far side: gaps open behind nearer surfaces.
+    """Fill unknown pixels from their surroundings, mostly from the far side, because gaps open behind near surfaces.
 
     Args:
         image: image, (H, W, 3).
         depth_m: depth, (H, W).
         confidence: confidence, (H, W); 0 is unknown.
-        wraps: the left edge borders on the right edge, as in a panorama.
+        wraps: True if the left edge borders on the right edge, as in a panorama.
     """
     seen = confidence > 0
-    if seen.all() or not seen.any():  # where nothing is known there is nothing to continue
+    if seen.all() or not seen.any():  # nothing to fill, or nothing to fill it from
         return image
     if not wraps:
         return fill_holes(image, seen, weight=depth_m * depth_m)
@@ -168,24 +167,24 @@ def to_8bit(image: Floats) -> NDArray[np.uint8]:
 
 
 class RayRenderer(abc.ABC):
-    """A space that is rendered ray by ray: its images in each projection."""
+    """Base of spaces that are rendered ray by ray, with their views in each projection."""
 
     @abc.abstractmethod
     def _view(self, rays: Rays, projection: str) -> View:
-        """Render the rays, (H, W); unknown parts are filled from their surroundings."""
+        """Render rays of shape (H, W). Unknown parts are filled from their surroundings."""
 
     def render(self, map_from_camera: NDArray[np.floating], width: int, height: int, fov_rad: float) -> View:
         """Render a perspective view along the camera's x axis with the horizontal field of view ``fov_rad``.
 
         Raises:
-            NotReadyError: no keyframe yet, where one is needed.
-            ValueError: a size or field of view that cannot be rendered, a pose that is not finite.
+            NotReadyError: the space needs a keyframe and has none yet.
+            ValueError: size or field of view cannot be rendered, or the pose is not finite.
         """
         check_size(width, height)
         return self._view(perspective_rays(checked_pose(map_from_camera), width, height, fov_rad), "perspective")
 
     def render_equirect(self, map_from_camera: NDArray[np.floating], width: int) -> View:
-        """Render a panorama, ``width`` × ``width / 2``. Raises as ``render``."""
+        """Render a panorama of ``width`` × ``width / 2`` pixels. Raises the same errors as ``render``."""
         check_size(width, width // 2)
         if width % 2:
             raise ValueError(f"a panorama's width must be even (got {width})")

@@ -1,4 +1,4 @@
-"""Compiles the kernels before the first keyframe needs them."""
+"""Compilation of the kernels before the first keyframe needs them."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from instant_ic.vspace.space import VirtualSpace
 
 
 def warm_up(config: VirtualSpaceConfig | None = None) -> None:
-    """Render a scratch space of the same kind once, trained where the kind is: numba's kernels are compiled and cached.
+    """Render, and if necessary train, a test space once, so that numba compiles and caches all kernels.
 
-    About 8 s of CPU on the first run of an installation, below 1 s after it.
+    This takes about 8 s of CPU time in the first run of an installation, and below 1 s afterwards.
     """
     config = config or VirtualSpaceConfig()
-    if config.source == "mesh":  # renders its first image as it is made
+    if config.source == "mesh":  # a mesh space renders its first view when it is created
         return
     leave_out_blas()
     small = dataclasses.replace(
@@ -31,7 +31,7 @@ def warm_up(config: VirtualSpaceConfig | None = None) -> None:
     rgb[::2] = 255
     below = np.sin((np.arange(32) - 15.5) * (math.pi / 32))[:, None]
     depth = np.repeat(np.minimum(4.0, 1.2 / np.maximum(below, 0.1)), 64, 1).astype(np.float32)  # walls and a floor
-    depth[12:20, 28:36] = 2.0  # a thing that hides what lies behind it
+    depth[12:20, 28:36] = 2.0  # an object in front of a wall
     aside = np.eye(4)
     aside[1, 3] = 1.0
     for pose in (aside, np.eye(4))[-config.keyframes :]:

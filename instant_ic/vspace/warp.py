@@ -1,7 +1,7 @@
-"""Views by warping the newest panorama by its depth: no training, and the baseline of the field.
+"""Views by warping a panorama by its depth, without training; the baseline of the field.
 
-The panorama's depth image is a mesh, cut at depth discontinuities and rendered into a z-buffer. Colours come from the
-panorama at its full resolution, averaged over each pixel's footprint. Gaps are continued from their farther side.
+The depth image is a mesh that is cut at depth discontinuities and rendered into a z-buffer. Colours come from the
+panorama at full resolution, averaged over each pixel's footprint. Gaps are filled from their farther side.
 """
 
 from __future__ import annotations
@@ -19,14 +19,15 @@ from instant_ic.vspace.prior import ROOM, PanoramaPrior, edge_quads
 from instant_ic.vspace.view import View, check_size, checked_pose, continue_unseen, perspective_rays, to_8bit
 
 EDGE_RATIO = 0.05
-"""Neighbouring depths that differ by more than this share, off one plane, are an edge."""
+"""Relative difference of neighbouring depths above which there is an edge, unless they lie on one plane."""
 BLUR = 0.65
-"""Share of a pixel that a colour is averaged over; trilinear look-up blurs by itself (as in ``sim.render``)."""
+"""Share of a pixel over which a colour is averaged; below 1, because trilinear look-up also blurs (see ``sim.render``).
+"""
 
 
 @dataclass(frozen=True)
 class Pyramid:
-    """A panorama at full, half, quarter... size, area-averaged.
+    """An image pyramid: a panorama at full, half, quarter and so on of its size, area-averaged.
 
     Attributes:
         texels: rows of all levels one after another, (N, 3) uint8.
@@ -57,8 +58,8 @@ class Pyramid:
         Args:
             camera_from_map: inverse pose of the panorama, (4, 4) float32.
             rays: P rays of the view.
-            depth: metres along the rays, (P,); 0 where nothing is met.
-            wanted: over 0 where a colour is wanted, (P,).
+            depth: metres along the rays, (P,); 0 where a ray hits nothing.
+            wanted: positive where a colour is wanted, (P,).
             share: weight of the panorama in the result, 0 to 1.
             colour: RGB of the view, 0 to 1, (P, 3); updated in place.
         """
@@ -80,10 +81,10 @@ class Pyramid:
 
 
 class PanoramaWarp:
-    """A panorama with depth that can be seen from elsewhere.
+    """A panorama with depth that can be rendered from other positions.
 
     Attributes:
-        inverse, depth_edge, known: arrays of its mesh, as ``warp_kernels.render_mesh`` takes them, (h + 2, w).
+        inverse, depth_edge, known: arrays of the mesh for ``warp_kernels.render_mesh``, (h + 2, w).
 
     Example:
         >>> warp = PanoramaWarp(prepare(rgb, depth_m, map_from_camera, 0.0, GeometryConfig(), 4096))  # doctest: +SKIP
@@ -101,15 +102,15 @@ class PanoramaWarp:
         self.pyramid = pyramid or Pyramid.of(prior.rgb)
         self._camera_from_map = np.linalg.inv(prior.map_from_camera).astype(np.float32)
         height, width = prior.inverse_depth.shape
-        # A row more above and below closes the mesh at the poles.
+        # An additional row above and below closes the mesh at the poles.
         self.inverse, self.known = (
             np.ascontiguousarray(np.concatenate([a[:1], a, a[-1:]])) for a in (prior.inverse_depth, prior.known)
         )
         none = np.zeros((1, width), np.uint8)
-        # The last row's own quads reach down to the pole, where there is no depth edge.
+        # The quads of the last row reach down to the pole, where there is no depth edge.
         depth_edge = edge_quads(prior.inverse_depth, EDGE_RATIO)
         gone = prior.content != ROOM
-        if gone.any():  # quads at its rim are rendered by their corners, of which it has none
+        if gone.any():  # quads at the rim of removed pixels are rendered only at their remaining corners
             right = np.roll(gone, -1, 1)
             depth_edge[:-1] |= (gone | right)[:-1] | (gone | right)[1:]
             depth_edge[-1] = 0
@@ -126,10 +127,10 @@ class PanoramaWarp:
     def render(self, map_from_camera: NDArray[np.floating], width: int, height: int, fov_rad: float) -> View:
         """Render a perspective view along the camera's x axis with the horizontal field of view ``fov_rad``.
 
-        Confidence is 1 where the panorama has seen the place, 0.5 where its depth was filled from around, 0 elsewhere.
+        Confidence is 1 on surfaces that the panorama shows, 0.5 where their depth was filled, 0 elsewhere.
 
         Raises:
-            ValueError: a size or field of view that cannot be rendered, a pose that is not finite.
+            ValueError: size or field of view cannot be rendered, or the pose is not finite.
         """
         check_size(width, height)
         rays = perspective_rays(checked_pose(map_from_camera), width, height, fov_rad)
@@ -161,7 +162,7 @@ class PanoramaWarp:
         np.divide(1 / rays.axial, nearness.reshape(-1), out=depth, where=nearness.reshape(-1) > 0)
         confidence = np.array([0, 0.5, 1, 0], np.float32)[marks.reshape(-1)]
         colour = np.zeros((len(depth), 3), np.float32)
-        # From beyond every surface only backs are met: their colours, with no confidence, say more than black.
+        # A view from behind all surfaces shows only their backs. Colours without confidence are better than black.
         wanted = confidence if confidence.any() else depth
         self.pyramid.look_up(self._camera_from_map, rays, depth, wanted, 1.0, colour)
         return colour, depth, confidence
@@ -177,15 +178,15 @@ def pinhole(rays: Rays) -> tuple[NDArray[np.float64], np.float32]:
     pose = np.eye(4)
     pose[:3, :3] = np.stack([axis / np.linalg.norm(axis) for axis in (ahead, left, up)], axis=1)
     pose[:3, 3] = rays.origin
-    # The outermost pixels' centres lie half a pixel inside the image's edge.
+    # The centres of the outermost pixels lie half a pixel inside the image's edge.
     return pose, np.float32(0.5 * np.linalg.norm(left) * width / (width - 1))
 
 
-@functools.lru_cache(maxsize=2)  # a keyframe is as large as the one before
+@functools.lru_cache(maxsize=2)  # keyframes rarely change their size
 def _half_step_directions(width: int, height: int) -> NDArray[np.float32]:
-    """Return unit directions at every half pixel, a row more above and below, (2 height + 3, 2 width, 3).
+    """Return unit directions at every half pixel, with an additional row above and below, (2 height + 3, 2 width, 3).
 
-    Entry (2 v + 2, 2 u) is pixel (v, u)'s own; rows beyond a pole are the pole.
+    Entry (2 v + 2, 2 u) is the direction of pixel (v, u). Rows beyond a pole contain the pole's direction.
     """
     azimuth = math.pi - (np.arange(2 * width) + 1) * (math.pi / width)
     elevation = math.pi / 2 - (np.arange(-2, 2 * height + 1) + 1) * (math.pi / (2 * height))

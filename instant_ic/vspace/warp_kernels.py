@@ -1,4 +1,4 @@
-"""CPU kernels of the depth warp: panorama mesh into a z-buffer, and anti-aliased panorama look-up (numba)."""
+"""CPU kernels of the depth warp in numba: rendering of the panorama's mesh, and anti-aliased panorama look-up."""
 
 from __future__ import annotations
 
@@ -11,16 +11,19 @@ from instant_ic.vspace.nerf.kernels import _OPTIONS
 from instant_ic.vspace.nerf.march import along
 
 NEAR_M = 0.02
-"""Surfaces nearer to the view's plane are cut away."""
+"""Depth along the view's axis below which surfaces are cut away."""
 EMPTY, FILLED, KNOWN, BEHIND = 0, 1, 2, 3
-"""Content of a pixel: nothing, a surface of filled depth, one of known depth, one from its back."""
+"""Content of a pixel: nothing, a surface of filled depth, a surface of known depth, or the back of a surface."""
 MAX_TAPS = 8
-"""Samples along a stretched footprint, at most."""
+"""Largest number of samples along a stretched footprint."""
 
 
 @njit(**_OPTIONS)
 def beyond(x, y, z, half, tall):  # type: ignore[no-untyped-def]
-    """Return the view's planes beyond which a point lies, as bits; ``half``, ``tall``: tangents of half its angles."""
+    """Return the view's clipping planes beyond which a point lies, as bits.
+
+    ``half`` and ``tall`` are the tangents of half the horizontal and vertical field of view.
+    """
     code = 1 if x < NEAR_M else 0
     code |= 2 if y > half * x else 0
     code |= 4 if y < -half * x else 0
@@ -31,13 +34,14 @@ def beyond(x, y, z, half, tall):  # type: ignore[no-untyped-def]
 
 @njit(**_OPTIONS)
 def place_vertices(inverse, directions, view_from_camera, half, aspect, vertices, outside):  # type: ignore[no-untyped-def]
-    """Transform the mesh's corners to the view's frame, and find the view's planes that they lie beyond.
+    """Transform the mesh's corners to the view's frame, and find the clipping planes beyond which they lie.
 
     Args:
-        inverse: inverse depth, (h, w); directions: unit vectors, (h, w, 3).
-        view_from_camera: (4, 4) float32.
+        inverse, directions: inverse depth, (h, w), and unit vectors, (h, w, 3).
+        view_from_camera: pose of the panorama's camera in the view's frame, (4, 4) float32.
         half, aspect: tangent of half the horizontal field of view, and height over width of the view.
-        vertices: out, (h, w, 3); outside: out, (h, w) uint8, one bit a plane.
+        vertices: corners in the view's frame, (h, w, 3); written.
+        outside: one bit per clipping plane, (h, w) uint8; written.
     """
     height, width = inverse.shape
     m = view_from_camera
@@ -52,10 +56,10 @@ def place_vertices(inverse, directions, view_from_camera, half, aspect, vertices
 
 @njit(**_OPTIONS)
 def rasterize_triangle(a, b, c, clipped, mark, half, nearness, marks):  # type: ignore[no-untyped-def]
-    """Rasterize a triangle into the z-buffer; corners are (x, y, z) in the view's frame, x forward.
+    """Rasterize a triangle into the z-buffer. Its corners are (x, y, z) in the view's frame, x forward.
 
-    Edge functions are taken in homogeneous coordinates (Olano and Greer, 1997), so that nothing need be clipped:
-    ``clipped`` only says that a corner lies behind the view, where it has no place in the image to bound by.
+    Edge functions are computed in homogeneous coordinates (Olano and Greer, 1997), so that triangles need no clipping.
+    ``clipped`` is true if a corner lies behind the view, so that the corners give no bounding box in the image.
     """
     height, width = nearness.shape
     pixel = np.float32(2) * half / np.float32(width)
@@ -84,7 +88,7 @@ def rasterize_triangle(a, b, c, clipped, mark, half, nearness, marks):  # type: 
             ea, eb, ec = nax + nay * y + naz * z, nbx + nby * y + nbz * z, ncx + ncy * y + ncz * z
             ea, eb, ec = ea * scale, eb * scale, ec * scale
             near = ea + eb + ec
-            slack = np.float32(-1e-4) * near  # rounding leaves no cracks between neighbours
+            slack = np.float32(-1e-4) * near  # tolerates rounding, so that there are no cracks between neighbours
             inside = ea >= slack and eb >= slack and ec >= slack
             if inside and nearness[row, column] < near < np.float32(1 / NEAR_M):
                 nearness[row, column] = near
@@ -97,16 +101,16 @@ def render_mesh(  # type: ignore[no-untyped-def]
 ):
     """Render the panorama's mesh into a z-buffer.
 
-    A quad that crosses a depth edge is rendered as four quarters, each at the depth of its own corner: nothing is
-    missing from the panorama's own position, and the edge opens from the side.
+    A quad that crosses a depth edge is rendered as four quarters, each at the depth of its own corner. Seen from the
+    panorama's position nothing is missing, and seen from the side the edge opens.
 
     Args:
         vertices, outside: results of ``place_vertices``.
         inverse, depth_edge, known: arrays of the ``PanoramaPrior`` with one more row above and below, for the poles;
-            nothing is rendered where known is 2.
+            pixels whose ``known`` is 2 are not rendered.
         corners: unit vectors half a pixel up and left of each pixel, (h + 1, w, 3).
-        nearness: in and out, (H, W): inverse of the depth along the view's axis, 0 where nothing is.
-        marks: in and out, (H, W) uint8: ``EMPTY``, ``FILLED``, ``KNOWN`` or ``BEHIND``.
+        nearness: inverse depth along the view's axis, 0 where there is no surface, (H, W); updated in place.
+        marks: ``EMPTY``, ``FILLED``, ``KNOWN`` or ``BEHIND``, (H, W) uint8; updated in place.
     """
     height, width = inverse.shape
     m = view_from_camera
@@ -130,7 +134,7 @@ def render_mesh(  # type: ignore[no-untyped-def]
                 row, column = v + corner // 2, right if corner % 2 else u
                 if known[row, column] > 1:
                     continue
-                # The quarter between the pixel's own direction and the middle of the quad.
+                # The quarter between the pixel's direction and the middle of the quad.
                 depth = np.float32(1) / inverse[row, column]
                 tangled, common = False, 31
                 for k in range(4):
@@ -155,7 +159,7 @@ def render_mesh(  # type: ignore[no-untyped-def]
 
 @njit(**_OPTIONS)
 def _angle(y, x):  # type: ignore[no-untyped-def]
-    """Return ``atan2`` in float32, within 1e-6 rad, three times as fast: the polynomial of SLEEF's ``atanf_u35``."""
+    """Return ``atan2`` within 1e-6 rad by the polynomial of SLEEF's ``atanf_u35``, three times as fast as numba's."""
     ax, ay = abs(x), abs(y)
     t = min(ax, ay) / max(ax, ay, np.float32(1e-30))
     s = t * t
@@ -176,7 +180,7 @@ def _angle(y, x):  # type: ignore[no-untyped-def]
 
 @njit(**_OPTIONS)
 def panorama_places(camera_from_map, origin, directions, depth, height, width, places):  # type: ignore[no-untyped-def]
-    """Return index coordinates (u, v) in a panorama (height × width) of points along rays, (P, 2); −1e9 at depth 0."""
+    """Write the panorama's index coordinates (u, v) of points on rays to ``places`` (P, 2); −1e9 if the depth is 0."""
     for n in range(depth.shape[0]):
         if depth[n] <= 0:
             places[n, 0] = places[n, 1] = np.float32(-1e9)
@@ -188,7 +192,7 @@ def panorama_places(camera_from_map, origin, directions, depth, height, width, p
 
 @njit(**_OPTIONS)
 def _step(places, n, other, width):  # type: ignore[no-untyped-def]
-    """Return the step from place ``n`` to place ``other``, over the seam where that is shorter."""
+    """Return the step from place ``n`` to place ``other``, across the panorama's seam if that is shorter."""
     du, dv = places[other, 0] - places[n, 0], places[other, 1] - places[n, 1]
     if du > 0.5 * width:
         du -= width
@@ -199,7 +203,7 @@ def _step(places, n, other, width):  # type: ignore[no-untyped-def]
 
 @njit(**_OPTIONS)
 def _shorter_step(places, n, before, after, width):  # type: ignore[no-untyped-def]
-    """Return the change of place over one pixel of the view; at a depth edge, on the side without a jump."""
+    """Return the change of place per pixel of the view, taken at a depth edge on the side without a jump."""
     du, dv = _step(places, n, after, width) if after >= 0 else (np.float32(1e9), np.float32(0))
     eu, ev = _step(places, before, n, width) if before >= 0 else (np.float32(1e9), np.float32(0))
     return (du, dv) if du * du + dv * dv <= eu * eu + ev * ev else (eu, ev)
@@ -207,7 +211,7 @@ def _shorter_step(places, n, before, after, width):  # type: ignore[no-untyped-d
 
 @njit(**_OPTIONS)
 def _bilinear(texels, start, height, width, u, v, weight, out):  # type: ignore[no-untyped-def]
-    """Add ``weight`` × the bilinear colour of one level at index coordinates of that level."""
+    """Add ``weight`` × the bilinear colour of one level, at index coordinates of that level, to ``out``."""
     v = min(max(v, np.float32(0)), np.float32(height - 1))
     u0, v0 = math.floor(u), math.floor(v)
     fu, fv = u - np.float32(u0), v - np.float32(v0)
@@ -225,10 +229,10 @@ def _bilinear(texels, start, height, width, u, v, weight, out):  # type: ignore[
 
 @njit(**_OPTIONS)
 def _footprint(places, row, column, height, width, sizes, blur):  # type: ignore[no-untyped-def]
-    """Return the ellipse that a pixel of the view covers in the panorama, for ``look_up``.
+    """Return the ellipse in the panorama that a pixel of the view covers.
 
     Returns:
-        Its longer axis (u, v), the number of samples along it, and the pyramid's level.
+        Longer axis (u, v) of the ellipse, number of samples along it, and level of the pyramid.
     """
     full = np.float32(sizes[0, 1])
     n = row * width + column
@@ -242,7 +246,7 @@ def _footprint(places, row, column, height, width, sizes, blur):  # type: ignore
         ux, vx = np.float32(1), np.float32(0)
     if above < 0 and below < 0:
         uy, vy = np.float32(0), np.float32(1)
-    # Half axes of the ellipse: eigenvalues of J Jᵀ.
+    # The eigenvalues of J Jᵀ are the squares of the ellipse's half axes.
     p, q, r = ux * ux + uy * uy, ux * vx + uy * vy, vx * vx + vy * vy
     mean, half = np.float32(0.5) * (p + r), math.sqrt(np.float32(0.25) * (p - r) * (p - r) + q * q)
     major = blur * math.sqrt(mean + half)
@@ -250,7 +254,7 @@ def _footprint(places, row, column, height, width, sizes, blur):  # type: ignore
     taps = min(max(math.ceil(major / max(minor, np.float32(1)) - np.float32(0.25)), 1), MAX_TAPS)
     level = math.log2(max(minor, major / np.float32(taps), np.float32(1)))
     level = min(float(level), float(sizes.shape[0] - 1))
-    # Direction of the longer axis.
+    # Eigenvector of the longer axis.
     along_u, along_v = (q, mean + half - p) if p < r else (mean + half - r, q)
     length = math.sqrt(along_u * along_u + along_v * along_v)
     if length > 0:
@@ -260,19 +264,19 @@ def _footprint(places, row, column, height, width, sizes, blur):  # type: ignore
 
 @njit(**_OPTIONS)
 def look_up(texels, level_start, sizes, places, height, width, blur, wanted, share, colour):  # type: ignore[no-untyped-def]
-    """Blend in the panorama's colours under the pixels of a view, averaged over each pixel's footprint.
+    """Blend the panorama's colours, averaged over each pixel's footprint, into a view.
 
-    The footprint follows from the places of neighbouring pixels; a stretched one gets up to ``MAX_TAPS`` samples along
-    its longer side (anisotropic filtering).
+    The footprint follows from the places of neighbouring pixels. A stretched footprint gets up to ``MAX_TAPS`` samples
+    along its longer side (anisotropic filtering).
 
     Args:
         texels, level_start, sizes: arrays of the ``Pyramid``.
-        places: index coordinates of ``panorama_places`` for all pixels of the view, (P, 2), P = height · width.
+        places: result of ``panorama_places`` for all pixels of the view, (P, 2), P = height · width.
         height, width: size of the view.
-        blur: share of a pixel that is averaged over; trilinear look-up blurs by itself.
-        wanted: over 0 where a colour is wanted, (P,).
-        share: weight of the panorama in the result, 0..1.
-        colour: in and out, 0..1, (P, 3).
+        blur: share of a pixel over which a colour is averaged.
+        wanted: positive where a colour is wanted, (P,).
+        share: weight of the panorama in the result, 0 to 1.
+        colour: RGB of the view, 0 to 1, (P, 3); updated in place.
     """
     out = np.zeros(3, np.float32)
     for row in range(height):

@@ -1,7 +1,7 @@
 """Worker of the virtual space: one thread shows keyframes, renders requested views, and trains in idle time.
 
-Each piece of work is a job. A keyframe is shown first, then its layers are encoded, then the field learns it. Of
-waiting keyframes and of waiting views only the newest is kept. ``Turns`` shares the time of views and other work.
+Each piece of work is a job. A keyframe is first shown, then its layers are encoded, then the field learns it. Only the
+newest waiting keyframe and the newest waiting view are kept. ``Turns`` divides the time between views and other work.
 """
 
 from __future__ import annotations
@@ -33,27 +33,27 @@ from instant_ic.vspace.view import View
 from instant_ic.vspace.warm_up import warm_up
 
 KeyframeArrays = tuple[NDArray[np.uint8], NDArray[np.floating], NDArray[np.floating], float | NDArray[np.floating]]
-"""Panorama, depth, map_from_camera and relative sigma, as ``VirtualSpace.prepare`` takes them."""
+"""Panorama, depth, map_from_camera and relative sigma: the arguments of ``VirtualSpace.prepare``."""
 NICE = 5
-"""Scheduling priority of the worker's thread: robot control comes first."""
+"""Scheduling priority of the worker's thread, lower than that of robot control."""
 LEAST_SHARE = 0.25
-"""Least training time as a share of a view's rendering time, also where views alone take longer than their period."""
+"""Smallest training time relative to a view's rendering time, even if views alone take longer than their period."""
 SAME_POSE = 2e-3
-"""Largest difference of two poses that count as equal, in metres and radians: a third of a view's pixel."""
+"""Largest difference of two poses that count as equal, in metres and radians; about a third of a view's pixel."""
 _NOTHING_SEEN = 0.98
-"""A view with a larger share of unseen pixels shows nothing that is known."""
+"""Share of unseen pixels above which a view counts as showing nothing known."""
 
 
 @dataclass(frozen=True, eq=False)
 class IncomingKeyframe:
-    """A keyframe as it arrived.
+    """A keyframe as received.
 
     Attributes:
-        id: its number.
-        message: the message.
-        arrival_ns: time of its arrival.
-        decode: decodes it on the worker's thread; may raise ``KeyframeError``.
-        image: the camera's encoded panorama; None to encode it here.
+        id: number of the keyframe.
+        message: the received message.
+        arrival_ns: time of arrival.
+        decode: decodes the keyframe on the worker's thread; may raise ``KeyframeError``.
+        image: encoded panorama from the camera; None to encode the keyframe's.
     """
 
     id: int
@@ -65,7 +65,7 @@ class IncomingKeyframe:
 
 @dataclass(frozen=True)
 class ViewOrder:
-    """A requested view; ``pose`` returns map_from_camera or raises ValueError."""
+    """A requested view. ``pose`` returns map_from_camera or raises ValueError."""
 
     id: int
     message: Any
@@ -76,7 +76,7 @@ class ViewOrder:
     jpeg_quality: int
 
     def same_view(self, other: ViewOrder) -> bool:
-        """Return whether both ask for the same view."""
+        """Return whether both orders request the same view."""
         keys = ("width", "height", "fov_rad", "jpeg_quality")
         alike = all(getattr(self, key) == getattr(other, key) for key in keys)
         return alike and np.allclose(self.pose(), other.pose(), rtol=0, atol=SAME_POSE)
@@ -84,7 +84,7 @@ class ViewOrder:
 
 @dataclass(frozen=True)
 class EncodedView:
-    """A rendered view as it is sent, the order that it was rendered for, and the time that this took."""
+    """A rendered view as it is sent, with its order and its rendering time."""
 
     order: ViewOrder
     render_ms: float
@@ -98,14 +98,14 @@ class Job:
 
     Attributes:
         name: name in messages.
-        subject: name of the diagnosis that its failure sets. A failure of ``vspace`` would repeat at once: after it,
-            nothing is trained until the next keyframe.
-        work: does it, on the worker's thread.
-        then: takes its result, on the node's thread.
-        number: id of the keyframe or request, which a ValueError refuses; None if there is nothing to refuse.
+        subject: name of the diagnosis that a failure sets. After a failure of ``vspace``, which would repeat at once,
+            training stops until the next keyframe.
+        work: does the work, on the worker's thread.
+        then: receives the result, on the node's thread.
+        number: id of the keyframe or request that is refused if ``work`` raises ValueError; None if there is none.
         result: result of ``work``.
         error: error of ``work``.
-        status: status of the space afterwards; None while there is no space.
+        status: status of the space after the job; None while there is no space.
     """
 
     name: str
@@ -130,11 +130,11 @@ class Job:
 
 
 class Turns:
-    """Shares one device between rendering and training so that a frame rate is held.
+    """Division of a device's time between rendering and training that maintains a frame rate.
 
     Args:
         render_fps: target frame rate of requested views; training gets the remaining time.
-        train_ms_per_frame: longest uninterrupted training in ms, and so the longest wait of a requested view.
+        train_ms_per_frame: longest uninterrupted training in ms, and thus the longest wait of a requested view.
     """
 
     def __init__(self, render_fps: float, train_ms_per_frame: float) -> None:
@@ -144,19 +144,19 @@ class Turns:
         self._render_ms = 0.0
 
     def renders_next(self, works: bool) -> bool:
-        """Return whether a requested view is next: after each view comes other work, if there is any (``works``)."""
+        """Return whether a requested view is next. After each view, other work is next if there is any (``works``)."""
         return not (works and self._rendered_last)
 
     def rendered(self, render_ms: float) -> None:
-        """Note the rendering time of a view."""
+        """Record the rendering time of a view."""
         self._rendered_last, self._render_ms = True, render_ms
 
     def worked(self) -> None:
-        """Note other work than rendering."""
+        """Record that other work than rendering was done."""
         self._rendered_last = False
 
     def budget_ms(self) -> float:
-        """Return the length of training's turn, which starts now: the rest of the view's period, within the limits."""
+        """Return how long to train now: the remainder of a view's period, within the limits."""
         left = 1e3 / self.render_fps - self._render_ms if self._rendered_last else self.train_ms_per_frame
         self._rendered_last = False
         return min(self.train_ms_per_frame, max(left, LEAST_SHARE * self._render_ms))
@@ -167,21 +167,21 @@ class SpaceWorker:
 
     Args:
         config: parameters of the space.
-        turns: shares of rendering and other work.
+        turns: division of time between rendering and other work.
         now_ns: the node's clock.
-        robot: mask of the robot, as ``VirtualSpace`` takes it.
-        lockstep: no kernels are compiled ahead, no measured time counts, and training runs in ``train`` only; otherwise
-            it fills idle time.
+        robot: mask of the robot, see ``VirtualSpace``.
+        lockstep: compile no kernels in advance, ignore measured times, and train only in ``train``. Otherwise training
+            fills idle time.
 
     Attributes:
-        submit: hands a job to the worker's thread; ``take`` gets it back.
+        submit: passes a job to the worker's thread; ``take`` receives the finished job.
         diagnose: sets a diagnosis: name, level, text, values by keyword.
-        on_layers: takes the layers of a new keyframe.
-        on_view: takes a requested view.
+        on_layers: receives the layers of a new keyframe.
+        on_view: receives a requested view.
         space: the space; None until the warm-up is done.
         keyframe: newest keyframe that views show.
         status: status of the space after the last job.
-        failure: error that ended training; empty when there is none.
+        failure: error that ended training; empty if there is none.
     """
 
     submit: Callable[[Job], object]
@@ -206,14 +206,14 @@ class SpaceWorker:
         self._waiting_keyframe: IncomingKeyframe | None = None
         self._waiting_view: ViewOrder | None = None
         self._busy = False
-        self._todo: deque[Job] = deque()  # jobs that the shown keyframe still needs
-        self._learns = False  # the field has something to learn
+        self._todo: deque[Job] = deque()  # remaining jobs of the shown keyframe
+        self._learns = False  # True once the field has a scene to learn
         self._ready_seconds: float | None = None  # from the keyframe's arrival until READY
-        self._warned = False  # about the device
+        self._warned = False  # True while there is a warning about the device
         self._layers_version = 0
-        self._newest_view: EncodedView | None = None  # of the space as it is; the worker's thread has it
+        self._newest_view: EncodedView | None = None  # valid for the present space; used only by the worker's thread
         self._rendered_ns: deque[int] = deque(maxlen=20)
-        # Figures of the last rendered view; 0 = unknown.
+        # Figures of the last rendered view; 0 is unknown.
         self._render_ms = self._expected_psnr_db = self._unseen_share = 0.0
 
     # --- which job is next -----------------------------------------------------------------------------------------
@@ -223,12 +223,12 @@ class SpaceWorker:
         self._start(Job("warm_up", "vspace", self._make_space))
 
     def offer_keyframe(self, keyframe: IncomingKeyframe) -> None:
-        """Prepare and show a keyframe; it replaces one that still waits."""
+        """Prepare and show a keyframe. It replaces a keyframe that is still waiting."""
         self._waiting_keyframe = keyframe
         self.next()
 
     def request_view(self, order: ViewOrder) -> None:
-        """Render a view; it replaces one that still waits."""
+        """Render a view. It replaces a request that is still waiting."""
         self._waiting_view = order
         self.next()
 
@@ -238,7 +238,7 @@ class SpaceWorker:
             self._start(Job("train", "vspace", functools.partial(self._train, iterations, budget_ms), self._trained))
 
     def next(self) -> None:
-        """Start the next job, unless one runs or there is nothing to do."""
+        """Start the next job, unless one is running or there is nothing to do."""
         if self._busy or self.status is None:
             return
         trains = self._trains and not self._lockstep
@@ -309,7 +309,7 @@ class SpaceWorker:
         self.space.train(budget_ms, iterations)
 
     def _render(self, order: ViewOrder) -> EncodedView:
-        """Render a view, or return the newest one if it would be the same: a standing robot costs nothing."""
+        """Render a view, or return the newest view if it would be the same, so that a standing robot costs nothing."""
         assert self.space is not None
         if self._newest_view is not None and self._newest_view.order.same_view(order):
             return self._newest_view
@@ -323,7 +323,7 @@ class SpaceWorker:
     # --- the results -----------------------------------------------------------------------------------------------
 
     def take(self, job: Job) -> None:
-        """Take a job that was run: report its result or its error."""
+        """Receive a finished job, and report its result or its error."""
         self._busy, self.status = False, job.status
         if job.status is not None and (job.status.warning or self._warned):
             self._warned = bool(job.status.warning)
@@ -343,7 +343,7 @@ class SpaceWorker:
             self._ready_seconds = (self._now_ns() - self.keyframe.arrival_ns) / 1e9
 
     def _shown(self, keyframe: IncomingKeyframe) -> None:
-        """Note that a keyframe is shown, and the jobs that it still needs."""
+        """Record that a keyframe is shown, and queue its remaining jobs."""
         assert self.status is not None
         self.keyframe, self.failure, self._ready_seconds = keyframe, "", None
         self._todo.clear()
@@ -368,7 +368,7 @@ class SpaceWorker:
         self._rendered_ns.append(self._now_ns())
         text, empty = f"{order.width} x {order.height} in {self._render_ms:.0f} ms", view.unseen_share > _NOTHING_SEEN
         if empty:
-            text += ": no keyframe shows anything from that pose. Is it far away?"
+            text += ": no keyframe has seen anything from that pose. Is it far away?"
         self.diagnose("view", Level.WARN if empty else Level.OK, text, id=order.id)
         self.on_view(order, encoded)
 
@@ -403,11 +403,11 @@ class SpaceWorker:
             text += f"; learning keyframe {self.keyframe.id}"
         text += f"; shown: the {'field' if status.shows_field else 'warped panorama'}"
         if not math.isnan(status.gain_db):
-            text += f" (older keyframes by the field: {status.gain_db:+.1f} dB against the warp)"
+            text += f" (field compared with warp on older keyframes: {status.gain_db:+.1f} dB)"
         return text
 
     def figures(self) -> dict[str, Any]:
-        """Return the fields of VspaceStatus.msg, 0 or empty where unknown."""
+        """Return the fields of VspaceStatus.msg; unknown values are 0 or empty."""
         status, keyframe, now_ns, rendered = self.status, self.keyframe, self._now_ns(), self._rendered_ns
         learnt = status if keyframe is not None else None
         timed = len(rendered) > 1 and now_ns - rendered[-1] <= 2_000_000_000 and rendered[-1] > rendered[0]
@@ -430,7 +430,7 @@ class SpaceWorker:
 
 
 def _yield_to_others() -> None:
-    """Lower this thread's priority (Linux has one per thread); never raise it, which only root may."""
+    """Lower this thread's priority, which Linux keeps per thread. Raising it would need root."""
     if sys.platform == "linux":
         thread = threading.get_native_id()
         os.setpriority(os.PRIO_PROCESS, thread, max(NICE, os.getpriority(os.PRIO_PROCESS, thread)))

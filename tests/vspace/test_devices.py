@@ -116,5 +116,5 @@ def test_the_check_compares_views_too():
             return 1 - colour, depth, confidence
 
     check_device(Broken, CONFIG.field)
-    with pytest.raises(DeviceError, match="of an image's pixels"):
+    with pytest.raises(DeviceError, match="of a view's pixels"):
         check_device(WrongColours, CONFIG.field)

@@ -111,5 +111,5 @@ def test_bad_depth_is_refused(bad):
     inverse[3, 4] = bad
     with pytest.raises(ValueError, match="finite and > 0"):
         layer_mesh(inverse, none(inverse), everywhere(inverse))
-    with pytest.raises(ValueError, match="do not fit"):
+    with pytest.raises(ValueError, match="differ"):
         layer_mesh(inverse[:, :-1], none(inverse), everywhere(inverse))

@@ -156,7 +156,7 @@ def test_a_mesh_that_lies_elsewhere_is_told(room):
     space.set_keyframe(picture.rgb, np.full_like(picture.depth_m, np.nan), camera, 0.05)
     assert not space.status.warning  # nothing is known of it
     space.set_keyframe(picture.rgb, picture.depth_m, camera @ pose_matrix(0.4, 0.5, yaw=1.0), 0.05)
-    assert "is space.mesh_pose right?" in space.status.warning
+    assert "check space.mesh_pose" in space.status.warning
     space.set_keyframe(picture.rgb, picture.depth_m, camera, 0.05)
     assert not space.status.warning
 
