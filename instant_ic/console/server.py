@@ -39,6 +39,7 @@ BURST_REQUESTS = 150.0
 SOCKETS_PER_S = 5.0  # WebSockets opened by one address; a new one is sent everything that is shown
 BURST_SOCKETS = 20.0
 START_TIMEOUT_S = 10.0
+EXPIRY_S = 1.0  # between two searches for expired sign-ins
 SECURITY_HEADERS = {
     "Content-Security-Policy": "default-src 'self'; img-src 'self' blob: data:; form-action 'self'; "
     "frame-ancestors 'none'",
@@ -206,16 +207,23 @@ class ConsoleServer(PageServer):
         self.listener = listener = Listener(runner.server, *limits, self._tls, self._known)
         try:
             self.port = await listener.open(self.config.host, self.config.port)
-            driving = asyncio.create_task(self.drive.run())
+            tasks = [asyncio.create_task(self.drive.run()), asyncio.create_task(self._end_expired())]
             self._started.set()
             await self._finish.wait()
-            driving.cancel()
+            for task in tasks:
+                task.cancel()
             self.drive.stop()
             await listener.close()
             await self.pages.close()
         finally:
             await listener.close()
             await runner.cleanup()
+
+    async def _end_expired(self) -> None:
+        """End the pages whose sign-in has expired; a timer for each sign-in could fill the memory."""
+        while self.access.required:
+            await asyncio.sleep(EXPIRY_S)
+            self.pages.end_signed_out()
 
     def _application(self) -> web.Application:
         app = web.Application(middlewares=[self._guard], client_max_size=MAX_BODY)
@@ -299,15 +307,12 @@ class ConsoleServer(PageServer):
             await _pace(request, self._requests)
             await self._slow_down(request)
             return _sign_in_page("Wrong token.", self.plain_http)
-        lifetime_s = self.config.access.session_hours * 3600.0
         response = web.Response(status=303, headers={"Location": "/"})
         response.set_cookie(
             COOKIE, self.access.open_session(role, time.monotonic()), httponly=True, samesite="Strict",
-            secure=self._tls is not None, max_age=round(lifetime_s),
+            secure=self._tls is not None, max_age=round(self.config.access.session_hours * 3600),
         )  # fmt: skip
         self.pages.end_signed_out()  # pages whose sign-in the new one displaced
-        # 10 ms late: a timer that fires early would find the sign-in still valid.
-        asyncio.get_running_loop().call_later(lifetime_s + 0.01, self.pages.end_signed_out)
         logger.info("%s has signed in to %s", request.remote, role.value)
         return response
 

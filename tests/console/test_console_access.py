@@ -1,9 +1,11 @@
 """Sign-in by token, watchers, TLS: over real sockets where a browser or program would come in."""
 
 import asyncio
+import gc
 import shutil
 import ssl
 import subprocess
+import time
 
 import aiohttp
 import pytest
@@ -245,6 +247,17 @@ async def test_fault_an_expired_sign_in_drives_on(serve, files):
             closed = await read_to_the_end(socket)
         assert (socket.close_code, closed.extra) == (1008, "signed out")
         await expect_nobody_drives(http, server, other)
+
+
+async def test_sign_ins_leave_no_timers(serve, files):
+    """A right token signs in a thousand times a second."""
+    server = serve(access=files)
+    async with aiohttp.ClientSession(cookie_jar=aiohttp.DummyCookieJar()) as http:
+        for _ in range(20):
+            async with http.post(server.url + "sign-in", data={"token": WATCH}, allow_redirects=False) as response:
+                assert response.status == 303
+    timers = [each for each in gc.get_objects() if isinstance(each, asyncio.TimerHandle)]
+    assert not [timer for timer in timers if timer.when() > time.monotonic() + 3600.0]
 
 
 async def test_the_sign_ins_of_others_and_of_programs_stay_when_one_signs_out(serve, files):
