@@ -41,7 +41,7 @@ def decompress(data: bytes | memoryview, compression: str, declared_bytes: int |
     size = 0
     try:
         with _opened(data, compression) as stream:
-            while piece := stream.read(_PIECE):
+            while piece := stream.read1(_PIECE):  # read() would lose what comes before the end of a truncated frame
                 size += len(piece)
                 if size > most_bytes:
                     raise ValueError(f"data decompress to more than {most_bytes} bytes, the declared or maximum size")
