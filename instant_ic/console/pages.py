@@ -24,6 +24,7 @@ from instant_ic.control.robot_lease import Verdict
 from instant_ic.util.pace import current
 from instant_ic.util.web_access import TokenBucket
 
+EXPIRY_S = 1.0  # between two searches for expired sign-ins
 MAX_CLIENT_MESSAGE = 4096  # bytes
 BURST_S = 2.0  # seconds' worth of messages that may arrive at once, after a radio link has stalled
 FIRST_S = 0.25  # the same for a new page
@@ -177,6 +178,12 @@ class Pages:
             if self._access.required and session.cookie and self._access.role_of_session(session.cookie, now) is None:
                 logger.info("client %d closed: its sign-in has ended", session.number)
                 self._end(session, WSCloseCode.POLICY_VIOLATION, "signed out")
+
+    async def end_expired(self) -> None:
+        """End the sessions whose sign-in has expired, for ever; a timer for each sign-in could fill the memory."""
+        while self._access.required:
+            await asyncio.sleep(EXPIRY_S)
+            self.end_signed_out()
 
     def _drop(self, session: PageSession) -> None:
         """Remove a session: it loses the lease and receives nothing more."""

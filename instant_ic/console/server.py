@@ -39,7 +39,6 @@ BURST_REQUESTS = 150.0
 SOCKETS_PER_S = 5.0  # WebSockets opened by one address; a new one is sent everything that is shown
 BURST_SOCKETS = 20.0
 START_TIMEOUT_S = 10.0
-EXPIRY_S = 1.0  # between two searches for expired sign-ins
 SECURITY_HEADERS = {
     "Content-Security-Policy": "default-src 'self'; img-src 'self' blob: data:; form-action 'self'; "
     "frame-ancestors 'none'",
@@ -207,7 +206,7 @@ class ConsoleServer(PageServer):
         self.listener = listener = Listener(runner.server, *limits, self._tls, self._known)
         try:
             self.port = await listener.open(self.config.host, self.config.port)
-            tasks = [asyncio.create_task(self.drive.run()), asyncio.create_task(self._end_expired())]
+            tasks = [asyncio.create_task(self.drive.run()), asyncio.create_task(self.pages.end_expired())]
             self._started.set()
             await self._finish.wait()
             for task in tasks:
@@ -218,12 +217,6 @@ class ConsoleServer(PageServer):
         finally:
             await listener.close()
             await runner.cleanup()
-
-    async def _end_expired(self) -> None:
-        """End the pages whose sign-in has expired; a timer for each sign-in could fill the memory."""
-        while self.access.required:
-            await asyncio.sleep(EXPIRY_S)
-            self.pages.end_signed_out()
 
     def _application(self) -> web.Application:
         app = web.Application(middlewares=[self._guard], client_max_size=MAX_BODY)
