@@ -14,7 +14,7 @@ from instant_ic.cli.errors import UserError
 
 
 class Parser(argparse.ArgumentParser):
-    """Takes the completer of an argument (``cli.completion``) with its other options."""
+    """A parser whose ``add_argument`` also takes the argument's completer (``cli.completion``)."""
 
     def add_argument(self, *names: Any, completer: Any = None, **options: Any) -> argparse.Action:
         action = super().add_argument(*names, **options)
@@ -24,7 +24,7 @@ class Parser(argparse.ArgumentParser):
 
 
 def group(subparsers: Any, name: str, words: str, description: str, example: str = "") -> Any:
-    """Add a command that has verbs; returns what :func:`verb` adds them to."""
+    """Add a command that has verbs; return the object to which :func:`verb` adds them."""
     epilog = f"example: {example}" if example else None
     parser = subparsers.add_parser(name, help=words, description=description, epilog=epilog)
     return parser.add_subparsers(metavar="VERB", required=True)
@@ -38,11 +38,11 @@ def verb(
 
     Args:
         verbs: the subparsers, or the result of :func:`group`.
-        name: its name on the command line.
-        words: its line in the list of commands; also its description where there is no other.
-        run: its function, or MODULE.FUNCTION in ``instant_ic.cli``, which is then imported when it runs.
-        example: a command line.
-        description: the first paragraph of its help.
+        name: name of the command on the command line.
+        words: line in the list of commands; also the description if there is no other.
+        run: function of the command, or MODULE.FUNCTION in ``instant_ic.cli``, which is imported when the command runs.
+        example: a command line for the help.
+        description: first paragraph of the help.
         **options: other options of ``add_parser``.
     """
 
@@ -58,10 +58,10 @@ def verb(
 
 
 def check_files(*files: Path | None, suffix: str = "") -> None:
-    """Check the files to write before long work.
+    """Check, before long work, that files can be written.
 
     Raises:
-        UserError: a folder is missing, or a name has another suffix.
+        UserError: a folder is missing, or a name has the wrong suffix.
     """
     for file in files:
         if file is not None and not file.expanduser().absolute().parent.is_dir():
@@ -95,7 +95,7 @@ def not_negative(text: str) -> int:
 
 
 def numbers(form: str) -> Callable[[str], list[float]]:
-    """Return the type of an argument such as ``x,y,z,yaw``: as many finite numbers as names."""
+    """Return the type of an argument such as ``x,y,z,yaw``: one finite number for each name."""
 
     def parse(text: str) -> list[float]:
         try:

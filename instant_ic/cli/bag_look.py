@@ -1,4 +1,4 @@
-"""``ic bag info``, ``diff``, and ``recover``: the commands that work on files alone."""
+"""``ic bag info``, ``diff`` and ``recover``: the commands that need only files."""
 
 from __future__ import annotations
 

@@ -87,7 +87,7 @@ def _call(node: NodeControl, command: str, **arguments: Any) -> Any:
 
 
 def _node(kinds: tuple[str, ...], name: str, *, keeps_snapshots: bool = False) -> NodeInfo:
-    """Return the node that a command is for; of several recorders, the one that supports the command."""
+    """Return the node that a command addresses; among several recorders, the one that supports the command."""
     running = [node for node in list_nodes(run_dir()) if node.executable in kinds]
     chosen = [node for node in running if not name or node.name == name]
     if len(chosen) > 1:

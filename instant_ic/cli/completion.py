@@ -1,7 +1,7 @@
 """Completers for the shell: topics, nodes, parameters, types, launch files.
 
-argcomplete calls them at each press of TAB, so they import nothing heavy. It shows no errors, completes files by
-itself and leaves out what does not begin with the typed word.
+argcomplete calls them at each press of TAB, so they import nothing heavy. argcomplete shows no errors, completes files
+by itself, and leaves out entries that do not begin with the typed word.
 """
 
 from __future__ import annotations

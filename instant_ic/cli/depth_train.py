@@ -32,8 +32,8 @@ def add_parser(commands: Any) -> None:
         commands, "train", "train depth completion on rendered panoramas", train,
         "ic depth train --data runs/panoramas --export models/mine.onnx",
         "Train the completion network on rendered panoramas (ic depth render) and export it. Ctrl-C ends the training "
-        "early: the last weights are evaluated, saved and exported. The checkpoint's record has all evaluations; the "
-        "first one is that of the fused depth.",
+        "early: the last weights are evaluated, saved and exported. The checkpoint's record has all evaluations, the "
+        "first of which is that of the fused depth.",
     ).add_argument  # fmt: skip
     add("--data", type=Path, required=True, metavar="FOLDER", help="panoramas of ic depth render")
     add("--workers", type=positive_int, default=1, metavar="N", help="threads that read (%(default)s)")
@@ -68,7 +68,7 @@ def train(args: argparse.Namespace) -> int:
             with progress("training") as trainer.bar:
                 metrics = trainer.run()
     except ValueError as error:
-        if type(error) is not ValueError:  # errors of our own modules explain themselves
+        if type(error) is not ValueError:  # errors of our own modules already say what to do
             raise
         raise UserError(f"ic depth train: {error}", 2) from error
     print(json.dumps(metrics.as_dict()), flush=True)
@@ -88,7 +88,7 @@ def published_encoder() -> str:
     """Return the file of the encoder's ImageNet weights.
 
     Raises:
-        UserError: the package that has them is not installed.
+        UserError: the package that contains them is not installed.
     """
     found = importlib.util.find_spec(ENCODER_PACKAGE)
     if found is None or found.origin is None:
@@ -165,7 +165,7 @@ def render(args: argparse.Namespace) -> int:
     from instant_ic.training.rooms import RoomsConfig, render_rooms
 
     if args.textures:
-        load(str(args.textures.resolve()))  # an error here, not after the first world
+        load(str(args.textures.resolve()))  # fails here instead of after the first world
     try:
         recipe = RoomsConfig(args.worlds, args.poses, args.priors, args.first, args.height,
                              textures=str(args.textures.resolve()) if args.textures else "")  # fmt: skip
@@ -182,7 +182,7 @@ def render(args: argparse.Namespace) -> int:
 
 
 def ends_early(trainer: Trainer) -> contextlib.AbstractContextManager[None]:
-    """End the training cleanly on Ctrl-C or SIGTERM, as at the end of its schedule; a second signal aborts it."""
+    """End the training on Ctrl-C or SIGTERM as at the end of its schedule; a second signal aborts it."""
 
     def end(number: int, frame: FrameType | None) -> None:
         if trainer.stop:

@@ -1,4 +1,4 @@
-"""The checks of ``ic doctor``: each examines one thing and says what to do when it is wrong."""
+"""The checks of ``ic doctor``. Each one examines one thing and says what to do if it is wrong."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class Finding:
     Attributes:
         level: OK, WARN (a function will be missing or slow) or FAIL (the stack will not work).
         subject: the checked device, file or setting.
-        text: the result.
+        text: result of the check.
         advice: remedy; empty if nothing is wrong.
     """
 
@@ -74,7 +74,7 @@ def _configured(node: str, key: str, default: Any) -> Any:
     try:
         found = load_file(paths.shipped_file("config", "robot.yaml"), node).get(key)
     except (ParameterError, FileNotFoundError):
-        return default  # check_configuration reports the fault in the file
+        return default  # the fault in the file is reported by check_configuration
     return default if found is None else found.value
 
 
@@ -88,7 +88,7 @@ def run_checks(
         serial_port: port of the RoboClaw.
         camera_url: URL of the Theta.
         lidar_port: UDP port of the VLP-16's data.
-        listen_s: how long to wait for LiDAR packets.
+        listen_s: longest wait for LiDAR packets.
         missing: level of a missing device: FAIL or WARN.
     """
     yield from check_machine(run_dir)
@@ -185,7 +185,7 @@ def _shipped(folder: str, pattern: str) -> list[Path]:
 
 
 def check_ports(tcp: Mapping[int, str], udp: Mapping[int, str]) -> Iterator[Finding]:
-    """Check that ports are free; each is given with what needs it."""
+    """Check that ports are free. ``tcp`` and ``udp`` map each port to the name of its user."""
     for kind, word, ports in ((socket.SOCK_STREAM, "tcp", tcp), (socket.SOCK_DGRAM, "udp", udp)):
         for port, need in ports.items():
             try:
@@ -201,7 +201,7 @@ def check_ports(tcp: Mapping[int, str], udp: Mapping[int, str]) -> Iterator[Find
 
 
 def check_gpu() -> Iterator[Finding]:
-    """Look for a CUDA device that torch can use."""
+    """Check whether torch can use a CUDA device."""
     if importlib.util.find_spec("torch") is None:
         yield Finding(FAIL, "gpu", "torch is not installed", "pip install torch")
         return
@@ -216,7 +216,7 @@ def check_gpu() -> Iterator[Finding]:
 
 
 def check_network_filter(root: Path = Path("/proc/sys/net/ipv4/conf")) -> Iterator[Finding]:
-    """Check reverse-path filtering: strict filtering silently drops packets of a sensor in another subnet."""
+    """Check reverse-path filtering, which silently drops packets of a sensor in another subnet if it is strict."""
     strict = []
     for file in sorted(root.glob("*/rp_filter")):
         try:

@@ -1,4 +1,4 @@
-"""Options, checks and progress of the kinds of ``ic evaluate`` that drive many courses."""
+"""Shared options, checks and progress of the kinds of ``ic evaluate`` that drive many courses."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from instant_ic.cli.progress import progress
 
 
 def add_options(parser: argparse.ArgumentParser, episodes: int, jobs: int, timeout_s: float, plot: str) -> None:
-    """Add the options of every kind, with their defaults; ``plot`` says what the plot shows."""
+    """Add the options of every kind, with their defaults; ``plot`` is the help's text on the content of the plot."""
     add = parser.add_argument
     add("--episodes", type=int, default=episodes, metavar="N", help="number of courses (default: %(default)s)")
     add("--seed", type=int, default=0, help="seed of the courses and all noise (default: %(default)s)")
@@ -28,7 +28,7 @@ def add_options(parser: argparse.ArgumentParser, episodes: int, jobs: int, timeo
 
 
 def add_stack_options(parser: argparse.ArgumentParser, world: str, example: str) -> None:
-    """Add the options of the kinds that run the nodes; ``world`` explains the worlds, ``example`` is a parameter."""
+    """Add the options of the kinds that run the nodes. ``world`` explains the worlds, ``example`` is a parameter."""
     parser.add_argument("--world", default="corridors", metavar="W", help=f"{world} (default: %(default)s)")
     text = f"override a parameter, for example {example}; repeatable"
     parser.add_argument("-p", "--param", action="append", default=[], metavar="NODE.KEY:=VALUE", help=text)
@@ -44,16 +44,16 @@ def print_figures(figures: Any, *files: Path | None) -> None:
 
 
 def use_one_thread_for_matrices() -> None:
-    """Keep linear algebra, whose matrices are small here, from competing for cores; call it before numpy loads."""
+    """Keep linear algebra on one thread, since its matrices are small; call this before numpy is loaded."""
     for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
         os.environ.setdefault(name, "1")
 
 
 def check_outputs(args: argparse.Namespace, **suffixes: str) -> None:
-    """Check the files to write before hours of driving.
+    """Check, before hours of driving, that the output files can be written.
 
     Raises:
-        UserError: a folder is missing, or a file of an option in ``suffixes`` has another suffix.
+        UserError: a folder is missing, or the file of an option in ``suffixes`` has the wrong suffix.
     """
     check_files(args.json, args.plot)
     for name, suffix in suffixes.items():
@@ -64,7 +64,7 @@ def check_outputs(args: argparse.Namespace, **suffixes: str) -> None:
 
 @contextmanager
 def errors_for_the_user() -> Iterator[None]:
-    """Turn what an evaluation raises for a wrong value, a failed drive or the time limit into a ``UserError``."""
+    """Turn an evaluation's error about a wrong value, a failed drive or the time limit into a ``UserError``."""
     try:
         yield
     except (ValueError, RuntimeError, TimeoutError) as error:
@@ -73,7 +73,7 @@ def errors_for_the_user() -> Iterator[None]:
 
 @contextmanager
 def counted(what: str, total: int) -> Iterator[Callable[[str, str], None]]:
-    """Yield a function for each finished drive: it takes the text of the bar, and a line for a log without one."""
+    """Yield a function to call after each drive, with a text for the progress bar and a line for logs without one."""
     done = 0
     with progress(what) as show:
 

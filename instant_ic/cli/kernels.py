@@ -1,4 +1,4 @@
-"""Compilation of all numba kernels before the first start, which would wait a minute for them."""
+"""Compilation of all numba kernels before the first start, which would otherwise take a minute longer."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ PARTS = {
     "mapping": ("local_model",),
     "lidar": ("flatscan",),
 }
-"""Packages with kernels, the longest compilation first, and the modules whose ``warm_up()`` runs every kernel.
+"""Packages with kernels, in order of falling compilation time, and the modules whose ``warm_up()`` runs every kernel.
 
 Each package is compiled in a process of its own."""
 
@@ -36,22 +36,22 @@ _PACKAGE = Path(__file__).resolve().parents[1]
 def are_compiled() -> bool:
     """Return whether :func:`compile_all` has finished for these sources, this numba and this CPU."""
     try:
-        # The key first: it imports, and Python can lose a Ctrl-C during an import. The caller reports its start later.
+        # The key comes first, because it imports modules and Python can lose a Ctrl-C during an import.
         return source_key() == (cache_folder() / "kernels.txt").read_text()
     except OSError:
         return False
 
 
 def compile_all(report: Callable[[float], None]) -> list[str]:
-    """Compile the kernels that numba's cache lacks, with a process per core.
+    """Compile the kernels that numba's cache lacks, with one process per core.
 
-    A second caller waits for the first and then has nothing to do.
+    A second caller waits for the first one and then has nothing to do.
 
     Args:
-        report: called with the completed share, 0 to 1.
+        report: function called with the completed share, 0 to 1.
 
     Returns:
-        A text for each part that cannot be compiled. The nodes that need it try again at their start.
+        A text for each part that cannot be compiled. The nodes that need such a part try again at their start.
     """
     with (cache_folder() / "kernels.lock").open("w") as file:
         fcntl.flock(file, fcntl.LOCK_EX)
@@ -82,7 +82,7 @@ def _compile_parts(report: Callable[[float], None]) -> list[str]:
 
 
 def cache_folder() -> Path:
-    """Return the folder of the lock and the note; numba chooses the folder of its cache by the same rule."""
+    """Return the folder of the lock and of kernels.txt; numba chooses the folder of its cache by the same rule."""
     beside = _PACKAGE / "__pycache__"
     if given := os.environ.get("NUMBA_CACHE_DIR"):
         folder = Path(given)
@@ -93,14 +93,14 @@ def cache_folder() -> Path:
 
 
 def source_key(package: Path = _PACKAGE) -> str:
-    """Return a text that changes when numba compiles again: for another source file, numba, Python or CPU."""
+    """Return a text that changes when numba must compile again: after a change of source, numba, Python or CPU."""
     digest = hashlib.sha256(f"{package} {version('numba')} {sys.version} {platform.machine()}".encode())
     for file in sorted(package.rglob("*.py")):
         if b"numba" in (source := file.read_bytes()):
             digest.update(f"{file} {file.stat().st_mtime_ns}".encode() + source)
     for line in Path("/proc/cpuinfo").read_text().splitlines():
         if not line:
-            break  # the other cores are alike
+            break  # one core is enough, the others are alike
         if line.startswith(("model name", "flags")):
             digest.update(line.encode())
     return digest.hexdigest()
@@ -108,7 +108,7 @@ def source_key(package: Path = _PACKAGE) -> str:
 
 def main() -> None:
     """Compile one part, in a process of its own: ``python -m instant_ic.cli.kernels PART``."""
-    signal.signal(signal.SIGINT, signal.SIG_DFL)  # Ctrl-C ends it, even inside the compiler
+    signal.signal(signal.SIGINT, signal.SIG_DFL)  # Ctrl-C ends the process even inside the compiler
     part = sys.argv[1]
     for module in PARTS[part]:
         import_module(f"instant_ic.{part}.{module}").warm_up()

@@ -20,9 +20,9 @@ class LogLine:
     """One log entry; a traceback belongs to the entry before it.
 
     Attributes:
-        stamp: local date and time, ``2026-03-04 12:00:00.250``; empty if unknown.
+        stamp: local date and time, such as ``2026-03-04 12:00:00.250``; empty if unknown.
         level: one of ``LEVELS``.
-        text: the message; several lines for a traceback.
+        text: the message, with the lines of a traceback.
     """
 
     stamp: str
@@ -31,11 +31,11 @@ class LogLine:
     text: str
 
     def at_least(self, level: str) -> bool:
-        """Return whether the entry has this level or a higher one."""
+        """Return whether the entry has the given level or a higher one."""
         return LEVELS.index(self.level) >= LEVELS.index(level)
 
     def show(self, colour: bool) -> str:
-        """Return the entry for the terminal."""
+        """Return the entry as text for the terminal."""
         node, text = visible(self.node), visible(masked(self.text))
         if not colour:
             return f"{self.stamp} {self.level:<7} {node}: {text}"
@@ -49,13 +49,13 @@ def parse(text: str, node: str) -> list[LogLine]:
 
     Args:
         text: content of the file.
-        node: owner of the file; lines before the first entry (output of a library) are attributed to it.
+        node: owner of the file, to whom lines before the first entry (output of a library) are attributed.
     """
     lines: list[LogLine] = []
     for raw in text.splitlines():
         if match := _LINE.match(raw):
             if lines and not lines[0].stamp:
-                lines[0].stamp = match[1]  # at the latest
+                lines[0].stamp = match[1]  # the latest possible time of the lines before the first entry
             lines.append(LogLine(*match.groups()))
         elif lines:
             lines[-1].text += f"\n{raw}"
@@ -65,7 +65,7 @@ def parse(text: str, node: str) -> list[LogLine]:
 
 
 class GrowingLog:
-    """A growing log file, which is replaced when its node restarts."""
+    """A growing log file, which is replaced by a new one when its node restarts."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
@@ -85,7 +85,7 @@ class GrowingLog:
         except FileNotFoundError:
             return []
         self._offset += len(data)
-        # An incomplete line waits for its rest.
+        # An incomplete last line is kept until the rest of it arrives.
         whole, separator, rest = (self._partial + data).rpartition(b"\n")
         self._partial = rest
         return parse((whole + separator).decode(errors="replace"), self._path.stem)
@@ -96,7 +96,7 @@ class LogFolder:
 
     Args:
         folder: ``RUN_DIR/log``.
-        nodes: read only the files of these; empty reads all.
+        nodes: nodes whose files are read; empty: all nodes.
     """
 
     def __init__(self, folder: Path, nodes: Collection[str] = ()) -> None:

@@ -40,7 +40,7 @@ _FULL = (errno.ENOSPC, errno.EDQUOT)
 
 
 class _Version(argparse.Action):
-    """``--version``; looked up only when it is asked for."""
+    """The option ``--version``, whose text is looked up only when it is used."""
 
     def __call__(self, parser: argparse.ArgumentParser, *_: object) -> None:
         from importlib import metadata
@@ -82,7 +82,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 class _Terminated(KeyboardInterrupt):
-    """SIGTERM or SIGHUP, which end a command as Ctrl-C does: it stops what it started and removes its scratch files."""
+    """SIGTERM or SIGHUP. They end a command as Ctrl-C does: it stops its nodes and removes its temporary files."""
 
 
 def _main(argv: Sequence[str] | None) -> int:
@@ -103,7 +103,7 @@ def _main(argv: Sequence[str] | None) -> int:
 
 
 def _call(args: argparse.Namespace) -> int:
-    """Run the command; whatever it prints of bags, peers and files cannot control the terminal."""
+    """Run the command. Texts that it prints from bags, peers and files cannot control the terminal."""
     out, err = cast("IO[str]", VisibleStream(sys.stdout)), cast("IO[str]", VisibleStream(sys.stderr))
     with redirect_stdout(out), redirect_stderr(err):
         return _status(args)
@@ -119,20 +119,20 @@ def _status(args: argparse.Namespace) -> int:
         return 143
     except KeyboardInterrupt:
         return 130
-    except BrokenPipeError:  # ic topic echo ... | head
+    except BrokenPipeError:  # as in ic topic echo ... | head
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
     except Exception as error:
         if isinstance(error, OSError) and error.filename:  # a file that cannot be read or written
             print(f"ic: {error.filename}: {error.strerror}", file=sys.stderr)
             return 1
-        if isinstance(error, OSError) and error.errno in _FULL:  # a write reports no name
+        if isinstance(error, OSError) and error.errno in _FULL:  # an error of a write has no file name
             print(f"ic: a file could not be written: {error.strerror}. Free some space.", file=sys.stderr)
             return 1
-        if type(error) in (FileNotFoundError, FileExistsError):  # raised by us: by the system, it has a file name
+        if type(error) in (FileNotFoundError, FileExistsError):  # raised by our code: no file name, unlike the system's
             print(f"ic: {error}", file=sys.stderr)
             return 2
-        # Our own error classes carry a message for the user; anything else is a bug and keeps its traceback.
+        # Our own error classes have a message for the user. Any other error is a bug and keeps its traceback.
         if not type(error).__module__.startswith("instant_ic."):
             raise
         print(f"ic: {error}", file=sys.stderr)

@@ -1,4 +1,4 @@
-"""Messages built from YAML that the user types; an error names the path of the field."""
+"""Messages built from YAML that the user types. Errors name the path of the field."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def parse(text: str, name: str) -> Any:
     """Parse YAML text into the values of a message.
 
     Raises:
-        UserError: it is not YAML, or not a mapping.
+        UserError: the text is not YAML, or not a mapping.
     """
     try:
         values = yaml_value(text, name) if text.strip() else {}
@@ -42,7 +42,7 @@ def fields(name: str) -> list[tuple[str, Any]]:
     """Return the fields of a message type, with their types as rosbags describes them.
 
     Raises:
-        UserError: there is no such type.
+        UserError: the type is unknown.
     """
     return list(typestore().get_msgdef(find_type(name)).fields)
 
@@ -56,7 +56,7 @@ def build(name: str, values: Any, now_ns: int, path: str = "") -> Any:
         name: message type, full or short.
         values: mapping of field → value.
         now_ns: current time for ``auto`` and ``now``.
-        path: path of this message in the outermost one, for errors.
+        path: path of this message within the whole one, for errors.
 
     Raises:
         UserError: a field is unknown, or its value does not fit; the message names the path of the field.
@@ -134,7 +134,7 @@ def _scalar(base: str, most: int, value: Any, path: str) -> Any:
     kind = {"bool": bool, "string": str, "wstring": str}.get(base, float if base in _FLOATS else int)
     if kind is float and isinstance(value, float):
         return value
-    # A scan's range is infinite where nothing returns.
+    # Infinity must be accepted: a scan's range is infinite where nothing returns.
     if kind is float and isinstance(value, Scalar) and value.text.lower() in _NOT_FINITE:
         return float(value.text.replace(".", ""))
     try:

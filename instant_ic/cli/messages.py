@@ -1,4 +1,4 @@
-"""Messages as text: YAML with long arrays shortened for people, a line of JSON for programs."""
+"""Messages as text: for people YAML with shortened arrays, for programs a line of JSON."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ import yaml
 
 
 def field(message: Any, path: str) -> Any:
-    """Return a field by its dotted path; an index selects an entry of a list (``transforms.0.transform``).
+    """Return a field by its dotted path. An index selects an entry of a list (``transforms.0.transform``).
 
     Raises:
-        AttributeError: there is no such field; the message lists the existing ones.
+        AttributeError: the field does not exist; the message lists the existing ones.
     """
     value = message
     for part in path.split(".") if path else []:
@@ -36,7 +36,7 @@ def _fields(message: Any) -> list[tuple[str, Any]]:
 
 
 class _MessageDumper(getattr(yaml, "CSafeDumper", yaml.SafeDumper)):  # type: ignore[misc]
-    """Writes lists of plain values on one line."""
+    """A YAML dumper that writes lists of plain values on one line."""
 
     def represent_sequence(self, tag: str, sequence: Any, flow_style: bool | None = None) -> Any:
         return super().represent_sequence(tag, sequence, not any(isinstance(entry, dict) for entry in sequence))
@@ -47,7 +47,7 @@ def describe(value: Any, most: int | None = 12) -> str:
 
     Args:
         value: the message or field.
-        most: shorten arrays above this many values, and strings above ten times as many characters; None: never.
+        most: number of values above which arrays are shortened; for strings, ten times as many characters; None: never.
     """
     style: dict[str, Any] = {"default_flow_style": False, "sort_keys": False, "allow_unicode": True, "width": 1 << 20}
     text = str(yaml.dump(_shortened(value, most), Dumper=_MessageDumper, **style))
@@ -70,7 +70,7 @@ def _shortened(value: Any, most: int | None) -> Any:
 
 
 def json_line(value: Any) -> str:
-    """Return a message, or a field of one, as one line of JSON with every value."""
+    """Return a message, or a field of one, as one line of JSON with all values."""
     return json.dumps(_plain(value), ensure_ascii=False)
 
 

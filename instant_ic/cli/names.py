@@ -1,4 +1,4 @@
-"""Look up topics, nodes and message types that the user types; an unknown name gets a suggestion."""
+"""Look up topics, nodes and message types by name, with a suggestion for an unknown name."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ def absolute(topic: str) -> str:
 
 
 def near(name: str, known: Iterable[str], otherwise: str) -> str:
-    """Return ``did you mean 'x'?`` where a known name is similar, else ``otherwise``."""
+    """Return ``did you mean 'x'?`` if a known name is similar, else ``otherwise``."""
     close = difflib.get_close_matches(name, list(known), n=1)
     return f"did you mean {close[0]!r}?" if close else otherwise
 
 
 def topic_types() -> dict[str, str]:
-    """Return every published or subscribed topic → its type (``any`` where all its subscribers accept any type)."""
+    """Return the types of all published or subscribed topics, by topic; ``any`` if all subscribers accept any type."""
     run_dir = paths.run_dir()
     types = {info.topic: info.type_name for info in registry.list_topics(run_dir)}
     for node in registry.list_nodes(run_dir):
@@ -38,7 +38,7 @@ def unknown_topic(topic: str, known: Iterable[str]) -> str:
 
 
 def nobody_runs() -> str:
-    """Return the message for a run directory without running nodes; it names stacks in its subfolders (of a fleet)."""
+    """Return the message for a run directory without running nodes. It names stacks in subfolders, as of a fleet."""
     run_dir = paths.run_dir()
     inside = [folder.parent for folder in sorted(run_dir.glob("*/nodes")) if registry.list_nodes(folder.parent)]
     hint = f"; nodes are running in {', '.join(map(str, inside))}: ic --run-dir {inside[0]} ..." if inside else ""
@@ -49,7 +49,7 @@ def find_node(name: str) -> registry.NodeInfo:
     """Return a running node.
 
     Raises:
-        UserError: no running node has that name.
+        UserError: no running node has this name.
     """
     nodes = {node.name: node for node in registry.list_nodes(paths.run_dir())}
     if name.strip("/") not in nodes:
@@ -64,7 +64,7 @@ def find_type(name: str) -> str:
     """Return the full name of a message type, from its full or short name.
 
     Raises:
-        UserError: there is no such type.
+        UserError: the type is unknown.
     """
     from instant_ic.msg import MessageError, message_type, type_name, typestore
 

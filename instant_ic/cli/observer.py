@@ -1,4 +1,4 @@
-"""Raw subscriptions for commands, which are not nodes; the newest heartbeat of each node."""
+"""Raw subscriptions for commands, which are not nodes, and the newest heartbeat of each node."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from instant_ic.util.closing import Closing
 
 
 class TopicObserver(Closing):
-    """Subscribes to topics until the end of its ``with`` block.
+    """Subscriptions to topics, until the end of the ``with`` block.
 
     Args:
         topics: one or several names, with or without the leading slash.
@@ -36,14 +36,14 @@ class TopicObserver(Closing):
         names = [topics] if isinstance(topics, str) else list(topics)
         self.topics = list(dict.fromkeys(absolute(name) for name in names))
         self._run_dir = run_dir or paths.run_dir()
-        registry.prepare(self._run_dir)  # checks its owner before any content is used
+        registry.prepare(self._run_dir)  # checks the folder's owner before any content is used
         try:
             pace.use(pace.read(self._run_dir))
         except pace.PaceError as error:
             raise registry.RegistryError(str(error)) from error
         self.clock = SystemClock()
         self.received = 0
-        """Messages yielded by :meth:`batches`."""
+        """Number of messages yielded by :meth:`batches`."""
         self._ready = threading.Event()
         self.transport = LocalTransport(self._run_dir, f"ic_{os.getpid()}", self.clock.now_ns)
         try:
@@ -59,11 +59,11 @@ class TopicObserver(Closing):
         self.transport.close()
 
     def lost_by(self, topic: str) -> dict[str, int]:
-        """Return publisher → messages of a topic that were lost before they arrived here."""
+        """Return the number of a topic's messages that were lost before they arrived here, by publisher."""
         return self.subscriptions[topic].stats.lost_by
 
     def batches(self, duration_s: float, period_s: float) -> Iterator[list[Received]]:
-        """Yield arrived messages for ``duration_s``, at least every ``period_s`` (the list may then be empty)."""
+        """Yield lists of arrived messages for ``duration_s``, at least every ``period_s``; a list may be empty."""
         end_s = time.monotonic() + duration_s
         while (left_s := end_s - time.monotonic()) > 0:
             self._ready.wait(min(period_s, left_s))
@@ -73,7 +73,7 @@ class TopicObserver(Closing):
             yield batch
 
     def hint(self) -> None:
-        """Print to standard error which of the topics have no publisher yet."""
+        """Print a line to standard error for each topic that has no publisher yet."""
         known = {info.topic for info in registry.list_topics(self._run_dir)}
         for topic in self.topics:
             if topic not in known:
@@ -94,13 +94,13 @@ class TopicObserver(Closing):
 
 
 def newest(topic: str, timeout_s: float) -> Received | None:
-    """Return the next message of a topic; None without one within ``timeout_s``."""
+    """Return the next message of a topic; None if none arrives within ``timeout_s``."""
     with TopicObserver(topic) as observer:
         return next((received for batch in observer.batches(timeout_s, 0.1) for received in batch), None)
 
 
 class Heartbeats(TopicObserver):
-    """Listens to the heartbeats of every node in a run directory."""
+    """Subscription to the heartbeats of all nodes in a run directory."""
 
     def __init__(self, run_dir: Path) -> None:
         topics = {info.topic for info in registry.list_topics(run_dir) if info.type_name == TYPE}
@@ -108,11 +108,11 @@ class Heartbeats(TopicObserver):
         self.newest: dict[str, Heartbeat] = {}
 
     def listen(self, seconds: float, until: Collection[str] = ()) -> dict[str, Heartbeat]:
-        """Listen for some time, or until all the named nodes were heard; return the newest heartbeat of each node."""
+        """Listen for ``seconds`` or until the nodes in ``until`` were heard; return each node's newest heartbeat."""
         for batch in self.batches(seconds, 0.1):
             for received in batch:
                 if received.type_name == TYPE:
-                    with suppress(ValueError):  # it cannot be read: the node counts as silent
+                    with suppress(ValueError):  # a node whose heartbeat cannot be read counts as silent
                         beat = from_message(deserialize(received.payload, received.type_name))
                         self.newest[beat.node] = beat
             if until and all(node in self.newest for node in until):
@@ -121,7 +121,7 @@ class Heartbeats(TopicObserver):
 
 
 def hear(run_dir: Path, nodes: Collection[str], seconds: float = 2.5) -> dict[str, Heartbeat]:
-    """Return the heartbeats of the given nodes, without those that send none within ``seconds``."""
+    """Return the heartbeats of the given nodes, except those that send none within ``seconds``."""
     if not nodes:
         return {}
     with Heartbeats(run_dir) as heartbeats:

@@ -1,4 +1,4 @@
-"""Progress of a long command: a bar in a terminal, lines elsewhere."""
+"""Progress of a long command: a bar in a terminal, else lines."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ _DAY_S = 86400.0
 
 @contextmanager
 def progress(what: str) -> Iterator[Callable[..., None]]:
-    """Yield a function that shows the completed share, 0 to 1, on standard error; optionally with another text."""
+    """Yield a function that shows the completed share, 0 to 1, on standard error, with an optional text."""
     if sys.stderr.isatty():
         from rich.console import Console
         from rich.progress import Progress
 
-        # A drive takes minutes on a slow core: the remaining time follows from all drives, not from the last 30 s.
+        # A drive takes minutes on a slow core, so the remaining time is estimated from all drives, not the last 30 s.
         with Progress(console=Console(file=direct(sys.stderr)), speed_estimate_period=_DAY_S) as bar:
             task, shown = bar.add_task(what, total=1.0), 0.0
 
             def show(share: float, text: str = what) -> None:
                 nonlocal shown
-                if share >= 1.0 or share - shown >= 0.001:  # not for each of a million messages
+                if share >= 1.0 or share - shown >= 0.001:  # no update for each of a million messages
                     shown = share
                     bar.update(task, completed=share, description=text)
 

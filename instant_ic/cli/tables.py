@@ -7,7 +7,7 @@ from collections.abc import Iterable, Sequence
 
 from instant_ic.util.safe_text import direct, masked, visible
 
-_PIPE_WIDTH = 10_000  # a pipe or a file gets lines of any length
+_PIPE_WIDTH = 10_000  # so that lines in a pipe or file are never broken
 
 
 def print_table(rows: Iterable[Sequence[object]], headings: Sequence[str] = (), right: Sequence[int] = ()) -> None:
@@ -15,8 +15,8 @@ def print_table(rows: Iterable[Sequence[object]], headings: Sequence[str] = (), 
 
     Args:
         rows: cells of each row.
-        headings: names of the columns; empty prints none.
-        right: numbers of the columns that are aligned to the right.
+        headings: names of the columns; empty: no headings.
+        right: indices of the columns that are aligned to the right.
     """
     from rich.console import Console
     from rich.table import Table

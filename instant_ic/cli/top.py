@@ -82,7 +82,7 @@ def show(args: argparse.Namespace) -> int:
     with Heartbeats(run_dir) as heartbeats:
 
         def content(seconds: float, until_all: bool = False) -> Group:
-            """Return the table after listening for some time, or until all nodes were heard."""
+            """Return the table after listening for ``seconds``, or until all nodes were heard."""
             infos = registry.list_nodes(run_dir)
             rows = make_rows(infos, heartbeats.listen(seconds, [info.name for info in infos] if until_all else ()))
             for row in rows:
@@ -102,7 +102,7 @@ def show(args: argparse.Namespace) -> int:
 
 
 def _ask(row: NodeRow, run_dir: Path) -> None:
-    """Ask a node without a heartbeat, through its control channel, what it is doing."""
+    """Ask a node without a heartbeat for its activity, through its control channel."""
     try:
         status = NodeControl(run_dir, row.node, 0.3).status()
     except ControlError:

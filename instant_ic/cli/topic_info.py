@@ -33,7 +33,7 @@ def info(args: argparse.Namespace) -> int:
     if args.verbose:
         if nominal := expected_rate(topic):
             print(f"nominal rate: {nominal.rate_hz:g} Hz{f', {nominal.when}' if nominal.when else ''}")
-        # Commands such as ic topic pub publish too, but have no heartbeat.
+        # Only nodes have heartbeats, not commands that publish, such as ic topic pub.
         beats = hear(run_dir, {row[0] for row in rows} & {node.name for node in nodes})
         print_table([(*row, *_flow(beats.get(row[0]), row[1], topic)) for row in rows], (*headings, "RATE", "LOST"))
     else:
@@ -65,7 +65,7 @@ def show_node(args: argparse.Namespace) -> int:
 
 
 def _flow(beat: Heartbeat | None, role: str, topic: str) -> tuple[str, str]:
-    """Return rate and losses of a topic by a node's heartbeat, as text."""
+    """Return the rate and the losses of a topic as text, from a node's heartbeat."""
     flow = beat and (beat.outputs if role == PUBLISHES else beat.inputs).get(topic)
     if not beat or not flow:
         return "unknown", ""

@@ -1,4 +1,4 @@
-"""``ic topic pub``: publish messages from the command line. All values are checked before the first is sent."""
+"""``ic topic pub``: publish messages from the command line. All values are checked before the first message is sent."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _KEEP_S = 0.2  # time for the last message to arrive before the publisher closes
 
 
 def publish(args: argparse.Namespace) -> int:
-    """Publish messages until Ctrl-C, or the given number of them."""
+    """Publish messages until Ctrl-C, or a given number of them."""
     topic = registry.check_topic(absolute(args.topic))
     fields(args.type)  # raises for an unknown type
     full = type_name(message_type(args.type))

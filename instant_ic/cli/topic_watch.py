@@ -45,7 +45,7 @@ class Rate:
         self._last_ns: int | None = None
 
     def add(self, received: Received) -> None:
-        """Add the arrival of one message; restart the count when time jumps back (a bag that loops)."""
+        """Add the arrival of a message. The count restarts when time jumps back, as with a bag that loops."""
         now_ns = received.received_ns
         if self._last_ns is not None and now_ns < self._last_ns:
             self._gaps_s.clear()
@@ -54,7 +54,7 @@ class Rate:
         self._last_ns = now_ns
 
     def line(self) -> str:
-        """Return mean rate and spread of the gaps."""
+        """Return the mean rate and the spread of the gaps between messages."""
         if not self._gaps_s:
             return ""
         mean_s = fmean(self._gaps_s)
@@ -74,10 +74,10 @@ class Bandwidth:
         self._arrivals_s.append(time.monotonic())
 
     def line(self) -> str:
-        """Return bytes a second and sizes of the messages."""
+        """Return the bytes per second and the sizes of the messages."""
         if not self._sizes:
             return ""
-        # From the first message to now, so that a pause lowers the result.
+        # The time from the first message to now counts, so that a pause lowers the result.
         per_s = sum(self._sizes) / max(time.monotonic() - self._arrivals_s[0], 1e-3)
         return (
             f"{size_text(per_s)}/s from {len(self._sizes)} messages  size mean: {size_text(fmean(self._sizes))} "
@@ -95,7 +95,7 @@ class Delay:
         """Add one message.
 
         Raises:
-            UserError: its type has no stamp.
+            UserError: the message's type has no stamp.
         """
         message = deserialize(received.payload, received.type_name)
         if getattr(message, "transforms", None) is not None:
@@ -109,7 +109,7 @@ class Delay:
         self._ages_s.append((received.received_ns - stamp) / 1e9)
 
     def line(self) -> str:
-        """Return mean and spread of the ages."""
+        """Return the mean and the spread of the ages."""
         return f"average delay: {fmean(self._ages_s):.4f}  {_spread(self._ages_s)}" if self._ages_s else ""
 
 
@@ -129,7 +129,7 @@ def delay(args: argparse.Namespace) -> int:
 
 
 def _watch(args: argparse.Namespace, kind: type[Rate | Bandwidth | Delay]) -> int:
-    """Print a line per topic each second and at the end."""
+    """Print a line for each topic every second and at the end."""
     with TopicObserver(args.topic) as observer:
         watched = {topic: kind(args.window) for topic in observer.topics}
         width = max(map(len, watched)) if len(watched) > 1 else 0
@@ -156,12 +156,12 @@ def _watch(args: argparse.Namespace, kind: type[Rate | Bandwidth | Delay]) -> in
 
 
 def _spread(values: deque[float]) -> str:
-    """Return minimum, maximum and standard deviation of values in seconds, and their number."""
+    """Return minimum, maximum, standard deviation and number of values in seconds, as text."""
     return f"min: {min(values):.4f}s max: {max(values):.4f}s std dev: {pstdev(values):.5f}s window: {len(values)}"
 
 
 def losses(lost_by: Mapping[str, int]) -> str:
-    """Return the number of lost messages, by publisher: ``3 (vlp16_driver 3)``."""
+    """Return the number of lost messages in total and by publisher as text: ``3 (vlp16_driver 3)``."""
     by = ", ".join(f"{publisher} {count}" for publisher, count in sorted(lost_by.items()))
     return f"{sum(lost_by.values())} ({by})" if by else "0"
 

@@ -15,7 +15,7 @@ _VALUES = {"step": "count", "rate": "rate"}
 def add_parser(subparsers: Any) -> None:
     verbs = group(
         subparsers, "bag", "record, play, inspect, compare and recover bags",
-        "Work with bags: rosbag2 folders (MCAP) that ROS 2, Foxglove and rosbags can open.", "ic bag record -o drive",
+        "Work with bags: rosbag2 folders (MCAP), which ROS 2, Foxglove and rosbags can open.", "ic bag record -o drive",
     )  # fmt: skip
     _add_record(verbs)
     _add_play(verbs)
@@ -161,7 +161,7 @@ def topic_name(name: str) -> str:
 
 
 def pairs(words: list[str], separator: str, option: str) -> dict[str, str]:
-    """Return arguments of the form ``a:=b`` as a dictionary.
+    """Return arguments of the form FROM + separator + TO as a dictionary.
 
     Raises:
         UserError: an argument has another form.
@@ -194,5 +194,5 @@ def argument_of(command: str, value: float | None) -> dict[str, Any]:
 _SPAN: dict[str, Any] = {"type": _seconds, "metavar": "S"}
 _MEGABYTES: dict[str, Any] = {"type": _megabytes, "metavar": "SIZE"}
 _ONLY_GIVEN: dict[str, Any] = {"argument_default": argparse.SUPPRESS}
-"""Leave the defaults to the node."""
+"""Option of a parser that leaves the defaults to the node."""
 _MANY: dict[str, Any] = {"action": "append", "default": []}

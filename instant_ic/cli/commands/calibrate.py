@@ -86,7 +86,7 @@ def _guess(values: list[float]) -> Matrix:
 
 
 def _xyz_rpy(pose: Matrix) -> tuple[list[float], list[float]]:
-    """Return metres, and roll, pitch, yaw in degrees about fixed axes, rounded."""
+    """Return a pose's position in metres and its roll, pitch and yaw in degrees about fixed axes, rounded."""
     from scipy.spatial.transform import Rotation
 
     rpy = Rotation.from_matrix(pose[:3, :3]).as_euler("xyz", degrees=True)
@@ -122,7 +122,7 @@ def _summary(bag: Path, recording: CalibrationRecording, given: Matrix, result: 
 
 
 def _lidar_mount() -> Matrix:
-    """Return base_from_lidar of config/robot.yaml, for a bag without it."""
+    """Return ``base_from_lidar`` of config/robot.yaml, for a bag without this transform."""
     from instant_ic.bus.node_files import node_class
     from instant_ic.config import params
     from instant_ic.geometry.poses import pose_matrix

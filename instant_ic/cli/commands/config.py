@@ -1,4 +1,4 @@
-"""``ic config``: show where each value of a node comes from."""
+"""``ic config``: show a node's parameters and the origin of each value."""
 
 from __future__ import annotations
 

@@ -80,7 +80,7 @@ def estimate(args: argparse.Namespace) -> int:
     model = _load(args)
     rgb = np.ascontiguousarray(picture[..., ::-1])
     try:
-        model.estimate(rgb)  # the first run allocates memory; time the second
+        model.estimate(rgb)  # the first run allocates memory, so the second one is timed
         begin = time.perf_counter()
         depth = model.estimate(rgb)
     except ValueError as error:  # includes ManifestError

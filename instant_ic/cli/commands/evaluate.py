@@ -28,8 +28,8 @@ def add_parser(subparsers: Any) -> None:
         "ic evaluate recordings --pcap drive.pcap --panorama room.jpg -o runs/recordings",
         "Send a VLP-16 capture as UDP packets and a 360° photo through the Theta's Web API to the whole stack. "
         "Write a bag, the trained view beside the same crop of the photo, the depth and the map as PNG, "
-        "and summary.json to the output folder. Photo and capture count as from different places: the depth "
-        "is then in the model's own metres. With --same-place the LiDAR scales it, as on the robot.",
+        "and summary.json to the output folder. Photo and capture are taken to be from different places, so the depth "
+        "is in the model's own metres. With --same-place the LiDAR scales it, as on the robot.",
     ).add_argument  # fmt: skip
     add("--pcap", type=Path, required=True, help="capture of VLP-16 data packets")
     add("--panorama", type=Path, required=True, help="equirectangular photo (JPEG, 2:1)")
@@ -48,7 +48,7 @@ def evaluate_recordings(args: argparse.Namespace) -> int:
 
     from instant_ic.experiments.recordings import evaluate_recordings as run
 
-    console = Console(file=direct(sys.stderr), soft_wrap=True)  # the end of a log is not broken at 80 columns
+    console = Console(file=direct(sys.stderr), soft_wrap=True)  # log lines are not broken at 80 columns
     with console.status("starting") as status:
 
         def show_progress(text: str) -> None:

@@ -1,4 +1,4 @@
-"""``ic evaluate depth``: estimated depth of panoramas against the true depth, for each depth source."""
+"""``ic evaluate depth``: comparison of the estimated depth of panoramas with the true depth, by depth source."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ if TYPE_CHECKING:
     from instant_ic.experiments.depth import Evaluator
 
 _SHOWN = 12
-"""Panoramas of the plot."""
+"""Number of panoramas in the plot."""
 _THREADS = 2
-"""CPU threads of the models."""
+"""Number of CPU threads of the models."""
 
 
 def add_kind(kinds: Any) -> None:

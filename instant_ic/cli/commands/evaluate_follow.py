@@ -1,4 +1,4 @@
-"""``ic evaluate follow``: how well and how safely the r-bot follows a v-bot through random rooms."""
+"""``ic evaluate follow``: contacts and progress of an r-bot that follows a v-bot through random rooms."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``ic evaluate illusion``: compare what the operator sees inside and behind an obstacle with the truth."""
+"""``ic evaluate illusion``: comparison of the operator's views inside and behind an obstacle with the truth."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ def add_kind(kinds: Any) -> None:
         kinds, "illusion", "compare the operator's view inside and behind obstacles with the truth", run,
         "ic evaluate illusion --episodes 4 --json illusion.json --plot strip.png",
         "The drive of ic evaluate teleop with illusory control. Every frame in which the page shows the virtual "
-        "space is rendered by the CPU and compared with the simulator's image from the same pose: with the obstacle "
-        "before its near face, without it from there on. The same frames are also rendered with true "
+        "space is rendered by the CPU and compared with the simulator's image from the same pose, which contains the "
+        "obstacle only until the camera reaches its near face. The same frames are also rendered with true "
         "depth. Reports PSNR, SSIM and the share that no keyframe has seen. The same seed gives the same figures.",
     )  # fmt: skip
     add_options(parser, 20, 1, 7200.0, "rows of frames by distance")
@@ -60,6 +60,6 @@ def _evaluate(args: argparse.Namespace) -> int:
         save_json(args.json, figures)
     figures.pop("each")
     print_figures(figures)
-    if args.plot:  # last: without an obstacle there is no strip
+    if args.plot:  # last, because this fails if no drive met an obstacle
         illusion.save_strip(args.plot, films)
     return 0

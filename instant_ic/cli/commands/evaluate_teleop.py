@@ -1,4 +1,4 @@
-"""``ic evaluate teleop``: a simulated operator, who only sees goals, drives corridors with obstacles."""
+"""``ic evaluate teleop``: a simulated operator who sees only goals drives through corridors with obstacles."""
 
 from __future__ import annotations
 

@@ -41,7 +41,7 @@ def add_parser(subparsers: Any) -> None:
     text = "recording to use instead of worlds (not for operators): later panoramas are the truth"
     add("--bag", type=Path, help=text)
     add("--meshes", type=Path, metavar="DIR", help="environments: also the meshes of this folder")
-    add("--quick", action="store_true", help="two seeds, small images, short training: does everything work?")
+    add("--quick", action="store_true", help="two seeds, small images and short training, to check that all works")
     text = "units in parallel (default: %(default)s)"
     add("--jobs", type=positive_int, default=os.cpu_count() or 1, metavar="N", help=text)
     add("--timeout", type=_limit, default=86400.0, metavar="S", help="limit for all units (default: %(default)g s)")
@@ -84,7 +84,7 @@ def _experiment(args: argparse.Namespace) -> int:
         report.write(args.out, sections, results, conditions)
 
     folder.mkdir(parents=True, exist_ok=True)
-    write(found)  # what there is, before hours of work
+    write(found)  # the results so far, before hours of work
     with progress("measuring") as show:
         done = 0
 

@@ -1,4 +1,4 @@
-"""``ic keys``: keys of this host and of the hosts it is linked with."""
+"""``ic keys``: keys of this host and of the hosts linked with it."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def _store(args: argparse.Namespace) -> KeyStore:
 
 
 def host_name() -> str:
-    """Return the host name of this machine in the form that the link accepts."""
+    """Return this machine's host name in the form that the link accepts."""
     import re
     import socket
 
@@ -91,7 +91,7 @@ def show(args: argparse.Namespace) -> int:
 
 
 def let_in(args: argparse.Namespace) -> int:
-    """Allow a host; also create this host's own key where it has none, since the link needs it."""
+    """Allow a host; also create this host's own key if it has none, since the link needs one."""
     from instant_ic.bridge.host_keys import Peer, check_name, parse_key
 
     store = _store(args)

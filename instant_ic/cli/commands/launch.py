@@ -74,12 +74,12 @@ def run(args: argparse.Namespace) -> int:
     from instant_ic.launch.app import run_stack
 
     if any(node.exec in kernels.NODES for node in description.nodes):
-        kernels.run()  # what fails here is reported by the node that needs it
+        kernels.run()  # failures are reported by the nodes that need the kernels
     return run_stack(description, run_dir, False if args.plain else None, args.pace, verbose=args.verbose)
 
 
 def _pace(text: str) -> float | None:
-    """Read the value of ``--pace``; None is auto."""
+    """Read the value of ``--pace``; None stands for auto."""
     from instant_ic.util.pace import PaceError, check_factor
 
     try:

@@ -25,8 +25,8 @@ def add_parser(subparsers: Any) -> None:
     add = verb(
         verbs, "local", "save the local 3D model as a point cloud", save_local,
         "ic map local -o cloud.ply",
-        "Save the local 3D model (what the LiDAR has measured over the last 10 m of the way) as a PLY file, in the "
-        "map frame (topic /map/local of the running stack, also of `ic launch replay bag:=BAG`).",
+        "Save the local 3D model (the LiDAR's measurements over the last 10 m of the way) as a PLY file, in the map "
+        "frame. It comes from topic /map/local of the running stack, which may be `ic launch replay bag:=BAG`.",
     ).add_argument  # fmt: skip
     add("-o", "--out", type=Path, required=True, metavar="FILE.ply", help="point cloud to write")
     add("--timeout", type=positive, default=10.0, metavar="S", help=text)

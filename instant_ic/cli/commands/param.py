@@ -52,7 +52,7 @@ def _control(node: str) -> NodeControl:
 
 
 def list_parameters(args: argparse.Namespace) -> int:
-    """Print parameters from the registry, which also works for a hanging node."""
+    """Print parameters from the registry, which also works for a hung node."""
     from instant_ic.bus import registry
     from instant_ic.cli.names import find_node, nobody_runs
     from instant_ic.config import params
@@ -74,7 +74,7 @@ def list_parameters(args: argparse.Namespace) -> int:
 
 
 def get_parameter(args: argparse.Namespace) -> int:
-    """Print a value, or those of a group."""
+    """Print the value of a parameter, or the values of a group."""
     from instant_ic.cli.names import find_node
     from instant_ic.config import params
 
@@ -88,7 +88,7 @@ def get_parameter(args: argparse.Namespace) -> int:
 
 
 def _matching(node: str, key: str, known: Iterable[str]) -> list[str]:
-    """Return the parameters of a name: one, or those of a group."""
+    """Return the parameters that a key names: one, or all of a group."""
     from instant_ic.cli.names import near
 
     found = [name for name in known if name == key or name.startswith(f"{key}.")]
@@ -98,7 +98,7 @@ def _matching(node: str, key: str, known: Iterable[str]) -> list[str]:
 
 
 def set_parameters(args: argparse.Namespace) -> int:
-    """Change parameters together."""
+    """Change several parameters together, or none of them."""
     from instant_ic.config import params
 
     words = args.pairs
@@ -150,7 +150,7 @@ def dump(args: argparse.Namespace) -> int:
 
 
 def load(args: argparse.Namespace) -> int:
-    """Set the parameters of a file. Those that already have the file's value need not be live."""
+    """Set the parameters of a file. Parameters that already have the file's value need not be live."""
     from instant_ic.cli.names import find_node
     from instant_ic.config import params
 

@@ -17,7 +17,7 @@ def add_parser(subparsers: Any) -> None:
         "ic run grid_slam --params-file config/slam.yaml -p use_sim_time:=true -r /scan:=/front/scan",
         "Run one node until Ctrl-C. Arguments after its name go to the node: ic run NODE --help",
     )  # fmt: skip
-    text = "name of a node (an unknown name lists all), or a Python file with a node"
+    text = "name of a node (an unknown name lists all names), or a Python file with a node"
     parser.add_argument("node", metavar="NODE", help=text, completer=completion.programs)
     parser.add_argument("arguments", nargs=argparse.REMAINDER, metavar="ARGUMENTS", help="arguments for the node")
     parser.set_defaults(leaves=True)

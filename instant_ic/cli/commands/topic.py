@@ -63,7 +63,7 @@ def _add_publishing(verbs: Any) -> None:
     add = _with_topic(verb(verbs, "pub", "publish messages", "topic_pub.publish", example))
     text = "full or short name, for example TwistStamped"
     add("type", metavar="TYPE", help=text, completer=completion.types)
-    text = "values of its fields; others are zero; 'header: auto' and 'stamp: now' take the current time"
+    text = "values of fields; all others are zero; 'header: auto' and 'stamp: now' take the current time"
     add("values", metavar="YAML", nargs="?", default="{}", help=text)
     add("-r", "--rate", type=positive, default=1.0, metavar="HZ", help="rate (default: %(default)s)")
     add("-1", "--once", action="store_true", help="publish one message")
@@ -73,7 +73,7 @@ def _add_publishing(verbs: Any) -> None:
     text = "longest wait for subscribers (default: %(default)s)"
     add("--max-wait-time-secs", type=positive, default=10.0, metavar="S", help=text)
     add("--qos", choices=("sensor", "reliable", "latched"), default="reliable", help="default: reliable")
-    add("--force", action="store_true", help="publish even where a node commands the robot on this topic")
+    add("--force", action="store_true", help="publish even if a node commands the robot on this topic")
 
 
 def list_topics(args: argparse.Namespace) -> int:

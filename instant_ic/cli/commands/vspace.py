@@ -24,9 +24,9 @@ DEVICES = ("auto", "cpu", "cuda")
 SIZES = {"perspective": (640, 360), "equirect": (1024, 512)}
 """Default width and height of a view in pixels."""
 GIVEN_SIGMA, MODEL_SIGMA = 0.02, 0.1
-"""Relative standard deviation of depth from a file, and of a model's estimate."""
+"""Relative standard deviation of a depth from a file, and of a depth estimated by a model."""
 FEW_KNOWN = 0.1
-"""A view with a smaller share of known pixels gives a warning."""
+"""Share of known pixels below which a view gives a warning."""
 
 
 def add_parser(subparsers: Any) -> None:
@@ -43,7 +43,7 @@ def add_parser(subparsers: Any) -> None:
     info_parser = verb(verbs, "info", "print the content of a saved space", info, "ic vspace info room")
     info_parser.add_argument("space", type=Path, metavar="DIR", help="folder written by ic vspace train")
     for parser in verbs.choices.values():
-        # Makes "--pose -1,0,0,90" a value: argparse on its own only recognises single negative numbers.
+        # By itself, argparse recognises only single negative numbers as values, not "--pose -1,0,0,90".
         parser._negative_number_matcher = re.compile(r"-[\d.]")
 
 
@@ -125,7 +125,7 @@ def train(args: argparse.Namespace) -> int:
 
 
 def _keyframe(args: argparse.Namespace) -> tuple[NDArray[np.uint8], NDArray[np.float32], float]:
-    """Load the panorama, and load or estimate its depth in metres and the depth's relative standard deviation."""
+    """Load the panorama; load or estimate its depth in metres; return both and the depth's relative deviation."""
     from instant_ic.depth.files import load_depth, load_rgb
 
     rgb = load_rgb(args.panorama)
@@ -135,7 +135,7 @@ def _keyframe(args: argparse.Namespace) -> tuple[NDArray[np.uint8], NDArray[np.f
 
 
 def estimated_depth(model: Path | None, rgb: NDArray[np.uint8]) -> NDArray[np.float32]:
-    """Estimate the depth of a panorama in the model's own metres; print a note about that."""
+    """Estimate the depth of a panorama in the model's own metres; print a note that its scale is not measured."""
     from instant_ic.depth.model import DEFAULT_MODEL, DepthModel
     from instant_ic.util.paths import shipped_file
 
