@@ -39,7 +39,7 @@ def test_the_median_of_what_is_known_counts_and_guesses_are_not_known() -> None:
     [
         (np.full((8, 16), 0.1), "a number or as large as depth"),
         (np.full(PICTURE.depth_m.shape, np.inf), "must have finite values"),
-        (np.full(PICTURE.depth_m.shape, -0.1), "nowhere negative"),
+        (np.full(PICTURE.depth_m.shape, -0.1), "none of them negative"),
         (float("nan"), "relative_sigma must be finite"),
     ],
 )
