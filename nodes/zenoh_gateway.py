@@ -36,16 +36,16 @@ class ZenohGatewayConfig:
     Attributes:
         namespace: the robot's name in the fleet; ``/scan`` here is ``/robot1/scan`` there. Empty: names stay.
         domain: ROS domain (``ROS_DOMAIN_ID``).
-        mode: peer: of a router on this host, as rmw_zenoh; client: of a router elsewhere.
-        connect: routers to connect to; empty: tcp/localhost:7447, or those of the session file.
-        session_file: Zenoh configuration (JSON5), path or file of config/, which replaces mode; empty: none.
+        mode: peer joins through a router on this host, as rmw_zenoh does; client connects to a router elsewhere.
+        connect: routers to connect to; empty: tcp/localhost:7447, or the routers of the session file.
+        session_file: Zenoh configuration (JSON5), as a path or a file of config/, which replaces mode; empty: none.
         publish: topics to send: NAME or PATTERN, optionally followed by rate_hz=N for at most N messages per second.
         subscribe: topics to receive, names or patterns.
         commands: operators' commands to accept: /operator/cmd_vel, /operator/estop. Only over TLS with certificates on
-            both sides (session_file); without it only pressing the emergency stop.
+            both sides (session_file). Without TLS, only pressing the emergency stop is accepted.
         insecure_loopback_commands: accept commands without TLS where every link stays within this machine, as in a
             simulation; anybody who can run a program on it can then drive. Refused beside a real base.
-        unprotected: allows it beside a real base, with a permanent warning.
+        unprotected: allow ``insecure_loopback_commands`` beside a real base, with a permanent warning.
         limits: limits on the commands.
     """
 
@@ -79,7 +79,7 @@ class ZenohGatewayConfig:
 
 
 class ZenohGatewayNode(Node[ZenohGatewayConfig]):
-    """Discovers topics on both sides, reports counts and losses."""
+    """Node that finds topics on both sides, passes their messages, and reports counts and losses."""
 
     name = "zenoh_gateway"
     session: RosSession | None = None

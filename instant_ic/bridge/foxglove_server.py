@@ -167,7 +167,7 @@ class FoxgloveServer:
         dropped: messages dropped because a viewer was too slow.
         refused: rejected requests: wrong Origin, Host or token, or too many viewers.
         refusal: reason of the last rejection.
-        token: token that viewers need in the address; empty: none.
+        token: token that viewers need in the address; empty if they need none.
         port: TCP port of the server.
         wake: event that is set when a viewer comes or goes; the node then calls :meth:`reconcile`.
 

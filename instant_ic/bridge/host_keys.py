@@ -32,7 +32,7 @@ _NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_-]{0,62}\Z")
 
 
 class KeyFileError(RuntimeError):
-    """A key or key file cannot be used; the message says where and what to do."""
+    """A key or key file cannot be used; the message names the file and the remedy."""
 
 
 @dataclass(frozen=True)
@@ -115,7 +115,7 @@ def check_name(name: str) -> str:
 
 
 class KeyStore:
-    """The key files of one folder. Each method raises :class:`KeyFileError` with where and what to do.
+    """The key files of one folder. Each method raises :class:`KeyFileError`, which names the file and the remedy.
 
     Args:
         folder: the folder; None takes :func:`key_dir`.

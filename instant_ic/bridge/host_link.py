@@ -58,7 +58,7 @@ class Failed:
 
 LinkEvent = Event | Stranger | LinkProblem | Failed
 OnEvent = Callable[[str, LinkEvent], None]
-"""Takes the other host's name in this host's allow-list (empty for the link as a whole), and the event."""
+"""Callback with the other host's name in this host's allow-list (empty for the whole link), and the event."""
 
 
 @dataclass(frozen=True)

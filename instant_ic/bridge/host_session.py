@@ -64,7 +64,7 @@ class Clocks:
         return time.time_ns()
 
     def epoch_ns(self) -> int:
-        """Return the time of day at which the monotonic clock was zero; it changes only when the time of day is set."""
+        """Return the time of day at the monotonic clock's zero; it changes only when the time of day is set."""
         reads = []
         for _ in range(3):  # a busy machine may pause between the two clocks: keep the fastest reading
             before, wall, after = self.mono_ns(), self.wall_ns(), self.mono_ns()

@@ -150,7 +150,7 @@ class Incoming:
         self._gate_lock = threading.Lock()  # each subscription calls on its own thread
         self._topics: dict[str, _ImportedTopic] = {}
         self._refusing: set[str] = set()
-        self._driver = ""  # sender of the newest drive command, as the arbiter knows it
+        self._driver = ""  # sender of the newest drive command, by the name that the arbiter sees
         self._count_before = 0
         self._commands = set(commands) & {STOP} if no_commands else set(commands)
         for topic in self._commands:

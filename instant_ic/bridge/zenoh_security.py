@@ -43,7 +43,7 @@ def insecurity(config: Any) -> str:
     listen = _endpoints(config, "listen")
     for endpoint in [*_endpoints(config, "connect"), *listen]:
         if "#" in endpoint:
-            return f"{endpoint} has settings of its own behind the #; set them under transport.link.tls"
+            return f"{endpoint} has its own settings after the #; set them under transport.link.tls"
         if endpoint.partition("/")[0] not in _TLS_LINKS:
             return f"{endpoint} is not encrypted; use tls/ or quic/"
     tls = _value(config, "transport/link/tls") or {}

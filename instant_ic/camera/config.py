@@ -88,7 +88,7 @@ class ThetaCameraConfig:
             and ``{password}`` in the stream's address, or are put before its host.
         frame_id: the camera's frame.
         camera_mount: the camera's pose on base_link.
-        silence_s: seconds without an image that cause a warning; four times as long is an error.
+        silence_s: seconds without an image that cause a warning; four times as many cause an error.
         health_period_s: seconds between requests for the Theta's battery and temperature.
         theta: live preview.
         video: stream through OpenCV.

@@ -1,4 +1,4 @@
-"""Check that a camera's images show the present: no copies of earlier ones, and none of one colour."""
+"""Check that a camera's images show the present: they must neither repeat nor have a single colour."""
 
 from __future__ import annotations
 

@@ -10,7 +10,7 @@ from typing import Self
 from instant_ic.util.closing import Closing
 
 JPEG_QUALITY = 90
-"""Quality of images that do not come as JPEG, 1 to 100."""
+"""JPEG quality, 1 to 100, of images that the camera does not deliver as JPEG."""
 
 
 class CameraError(ConnectionError):

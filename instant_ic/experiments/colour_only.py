@@ -95,8 +95,8 @@ class ColourOnlyField:
         colour, _ = composite(field, torch.from_numpy(step))
         error = functional.mse_loss(colour, torch.from_numpy(target))
         (upstream,) = torch.autograd.grad(error, field)
-        # The kernel takes a weighted squared error; this target makes its gradient equal the desired one. The weight
-        # keeps target and output at the same magnitude, so that their difference keeps its precision.
+        # The kernel minimises a weighted squared error; with this target its gradient equals the desired one. The
+        # weight keeps target and output at the same magnitude, so that their difference keeps its precision.
         weight = np.float32(1 / RAYS)
         aim = out - (upstream.numpy() / (2 * weight)).reshape(-1, 4)
         same = np.full(len(points), weight, np.float32)

@@ -69,7 +69,7 @@ class Options:
 
 
 def kind_of(world: str) -> str:
-    """Return a generated world's name without its seed, and a mesh file's as it is."""
+    """Return the name of a generated world without its seed, or the unchanged name of a mesh file."""
     name = world.partition(":")[0]
     return name if name in GENERATED else world
 

@@ -20,7 +20,7 @@ class DecoderConfig:
         min_range: smallest range of a return, metres; nearer ones are dropped as too close.
         max_range: largest range of a return, metres; farther ones are dropped.
         fov_start_deg: start of the field of view that the sensor is set to, clockwise from ahead, degrees.
-        fov_end_deg: end of that field of view; 0 to 359 or 360 is the whole circle.
+        fov_end_deg: end of that field of view, degrees; a view from 0 to 359 or 360 is the whole circle.
     """
 
     cut_angle_deg: Annotated[float, Range(0, below=360)] = 180.0

@@ -29,7 +29,7 @@ class TimedPoints:
 
     @property
     def middle_ns(self) -> int:
-        """Time of the middle of the revolution; the stamp if it has no points."""
+        """Time of the middle of the revolution; the cloud's stamp if there are no points."""
         return self.stamp_ns + (round(0.5e9 * float(self.time_s[0] + self.time_s[-1])) if len(self.time_s) else 0)
 
 

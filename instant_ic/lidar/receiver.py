@@ -128,7 +128,7 @@ class PacketReceiver(Closing):
         self._selector.close()
 
     def read(self, timeout_s: float) -> Iterator[SensorDatagram]:
-        """Yield the sensor's datagrams; wait at most ``timeout_s`` for the first one, and yield nothing after that."""
+        """Yield the sensor's datagrams; wait at most ``timeout_s`` for the first one, and yield none if it is late."""
         if self._selector.select(timeout_s):
             time.sleep(_GATHER_S)
         for key, _ in self._selector.select(0.0):

@@ -95,7 +95,7 @@ class PacketStream:
         self._dual = False
         self._cut_before = False
         self._turned: int | None = None
-        """Turn from the cut angle to the last block, 0.01 degrees; None where the stream was interrupted."""
+        """Turn from the cut angle to the last block, 0.01 degrees; None after an interruption of the stream."""
         self._received_ns = 0
 
     def feed(self, payload: bytes, received_ns: int) -> Revolution | None:
@@ -150,7 +150,7 @@ class PacketStream:
 
         Args:
             step_us: time since the last packet on the sensor's clock; None before the first one.
-            sent_us: part of it in which the sensor sent packets.
+            sent_us: part of this time during which the sensor sent packets.
             elapsed_us: time since the last packet on the host's clock.
             dual: True if the new packet has two returns.
         """

@@ -88,7 +88,7 @@ class _Floor:
                 self.taken.append((x0 - 0.5, y0 - 0.5, x1 + 0.5, y1 + 0.5))
 
     def take(self, centre: tuple[float, float], size: tuple[float, float], margin: float = 0.0) -> bool:
-        """Reserve a rectangle if it lies inside and is free; return whether it was.
+        """Reserve a rectangle if it lies inside the zone and is free; return whether it was reserved.
 
         Args:
             centre: x and y in metres.

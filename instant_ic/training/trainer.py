@@ -64,7 +64,7 @@ class TrainingConfig:
         brightness: mean byte to which each image is scaled before the network, as in inference; 0: unchanged.
         evaluation_panoramas: number of held-out panoramas evaluated during training.
         checkpoint_s: seconds between checkpoints with evaluation.
-        max_range_m: ground truth beyond it is unknown; output beyond it is clipped.
+        max_range_m: range beyond which ground truth counts as unknown and output is clipped.
         mixed_precision: convolutions in bfloat16, or in float16 on a GPU without bfloat16.
         threads: CPU threads. On cores that other programs also use, more threads only wait for each other.
         seed: seed of weights, order and augmentation.
