@@ -112,7 +112,7 @@ def test_a_session_with_certificates_on_both_sides_may_carry_commands():
     [
         ({"connect": '"tcp/r.example:7447"'}, "tcp/r.example:7447 is not encrypted"),
         ({"connect": '"tls/r:7447", "tcp/127.0.0.1:7447"'}, "tcp/127.0.0.1:7447 is not encrypted"),
-        ({"connect": '"tls/r:7447#enable_mtls=false"'}, "settings of its own"),
+        ({"connect": '"tls/r:7447#enable_mtls=false"'}, "has its own settings"),
         ({"connect": ""}, "no endpoint"),
         ({"listen": '"tcp/[::]:7448"'}, "tcp/[::]:7448 is not encrypted"),
         ({"listen": '"tls/[::]:7448"'}, "no listen_certificate, listen_private_key"),
