@@ -19,7 +19,7 @@ from instant_ic.lidar.stream import PacketStream
 from instant_ic.msg import MessageError, cloud_array, deserialize, stamp_ns, transform_matrix
 from instant_ic.util.limits import decode_image
 
-PICTURE, CLOUD, PACKETS = (
+IMAGE, CLOUD, PACKETS = (
     "sensor_msgs/msg/CompressedImage",
     "sensor_msgs/msg/PointCloud2",
     "velodyne_msgs/msg/VelodyneScan",
@@ -42,7 +42,7 @@ class CalibrationRecording:
         frames: pairs of image and revolution, from as many places as the recording has.
         camera_from_lidar: (4, 4) from the transforms in the bag; None if they are missing.
         base_from_lidar: (4, 4) from the transforms in the bag; None if they are missing.
-        pictures: number of images in the bag.
+        images: number of images in the bag.
         places: number of places in the recording.
         moves: True if the bag has odometry, which compensates the motion.
     """
@@ -50,7 +50,7 @@ class CalibrationRecording:
     frames: list[CalibrationFrame]
     camera_from_lidar: Matrix | None
     base_from_lidar: Matrix | None
-    pictures: int
+    images: int
     places: int
     moves: bool
 
@@ -75,7 +75,7 @@ def read_recording(path: Path, most_frames: int = 24) -> CalibrationRecording:
         CalibrationError: the bag lacks images or revolutions, or none of them coincide in time.
     """
     with BagReader(path) as bag:
-        image_topic = _choose(bag, (PICTURE,), ("/camera/image/compressed",))
+        image_topic = _choose(bag, (IMAGE,), ("/camera/image/compressed",))
         transforms = _transforms(bag)
         stamps, camera = _stamps(bag, image_topic)
         moves = {_BASE, _ODOM} <= transforms.frames()
@@ -89,10 +89,10 @@ def read_recording(path: Path, most_frames: int = 24) -> CalibrationRecording:
         clouds = _nearest_clouds(bag, list(chosen))
         frames = []
         for message in bag.messages([image_topic]):
-            picture = deserialize(message.payload, message.type_name)
-            stamp = stamp_ns(picture)
+            image = deserialize(message.payload, message.type_name)
+            stamp = stamp_ns(image)
             if stamp in clouds:
-                rgb = _decoded(path, picture)
+                rgb = _decoded(path, image)
                 try:
                     frames.append(_frame(rgb, clouds[stamp], stamp, chosen[stamp], odom_from))
                 except TransformError as error:
@@ -102,7 +102,7 @@ def read_recording(path: Path, most_frames: int = 24) -> CalibrationRecording:
         frames=frames,
         camera_from_lidar=_known(transforms, camera, lidar),
         base_from_lidar=_known(transforms, _BASE, lidar),
-        pictures=len(stamps),
+        images=len(stamps),
         places=places,
         moves=moves,
     )
@@ -237,12 +237,12 @@ def _nearest_clouds(bag: BagReader, stamps: list[int]) -> dict[int, CalibrationC
     return found
 
 
-def _decoded(path: Path, picture: Any) -> NDArray[np.uint8]:
+def _decoded(path: Path, image: Any) -> NDArray[np.uint8]:
     import cv2
 
-    bgr = decode_image(bytes(picture.data), cv2.IMREAD_COLOR)
+    bgr = decode_image(bytes(image.data), cv2.IMREAD_COLOR)
     if bgr is None:
-        raise CalibrationError(f"{path}: the image at {stamp_ns(picture) / 1e9:.3f} s cannot be decoded")
+        raise CalibrationError(f"{path}: the image at {stamp_ns(image) / 1e9:.3f} s cannot be decoded")
     if bgr.shape[1] != 2 * bgr.shape[0]:
         raise CalibrationError(f"{path}: an image of {bgr.shape[1]} x {bgr.shape[0]} is not a full panorama (2:1)")
     return np.ascontiguousarray(bgr[..., ::-1])

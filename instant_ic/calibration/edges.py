@@ -156,7 +156,7 @@ def _across_rings(
     return points[wall] - above[wall][:, None] * floor.normal, lying
 
 
-def picture_edges(rgb: NDArray[np.uint8], sigma_px: float) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+def image_edges(rgb: NDArray[np.uint8], sigma_px: float) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Compute the strengths of a panorama's (H, W, 3) vertical and horizontal edges, (H, W), over their mean.
 
     Strengths are gradients of the logarithmic brightness, so that dark and bright corners count alike. The strongest

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from instant_ic.calibration.edges import CUES, UPRIGHT, find_floor, lidar_edges, picture_edges
+from instant_ic.calibration.edges import CUES, UPRIGHT, find_floor, image_edges, lidar_edges
 from instant_ic.geometry.poses import Matrix, pose_matrix, transform_points
 
 Floats = NDArray[np.floating]
@@ -105,7 +105,7 @@ class _EdgeLevel:
         sigma_px = blur_px * frames[0].rgb.shape[1] / 1024.0
         # A strongly blurred image needs fewer pixels.
         smaller = 2 ** max(int(math.log2(sigma_px / 2)), 0) if sigma_px >= 4 else 1
-        strengths = [picture_edges(_reduced(frame.rgb, smaller), sigma_px / smaller) for frame in frames]
+        strengths = [image_edges(_reduced(frame.rgb, smaller), sigma_px / smaller) for frame in frames]
         stack = np.stack([pair[kind] for kind in (0, 1) for pair in strengths])
         # One extra column, so that a point on the seam is interpolated between the last and the first column.
         self.strengths = np.ascontiguousarray(np.concatenate([stack, stack[:, :, :1]], axis=2))

@@ -15,14 +15,14 @@ def overlay(frame: CalibrationFrame, camera_from_lidar: Matrix, width: int = 160
     """Render points, near ones bright and far ones dark, on a dimmed panorama; (width / 2, width, 3) RGB."""
     import cv2
 
-    picture = cv2.resize(frame.rgb, (width, width // 2), interpolation=cv2.INTER_AREA)
-    picture = cv2.cvtColor(cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY), cv2.COLOR_GRAY2RGB) // 3 * 2
+    image = cv2.resize(frame.rgb, (width, width // 2), interpolation=cv2.INTER_AREA)
+    image = cv2.cvtColor(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), cv2.COLOR_GRAY2RGB) // 3 * 2
     points = transform_points(camera_from_lidar, np.asarray(frame.points, np.float64))
     rows, columns, range_m = nearest_points(points[~hidden(points)], width, width // 2)
     colours = coloured_depth(range_m[None], near=0.5, far=12.0)[0]
     for shift in (0, 1):
-        picture[np.minimum(rows + shift, width // 2 - 1), columns] = colours
-    return np.asarray(picture, np.uint8)
+        image[np.minimum(rows + shift, width // 2 - 1), columns] = colours
+    return np.asarray(image, np.uint8)
 
 
 def before_and_after(
@@ -35,8 +35,8 @@ def before_and_after(
     strips = []
     for number in places:
         for name, pose in (("before", before), ("after", after)):
-            picture = overlay(frames[number], pose, width)
-            band = np.ascontiguousarray(picture[round(0.25 * len(picture)) : round(0.72 * len(picture))])
+            image = overlay(frames[number], pose, width)
+            band = np.ascontiguousarray(image[round(0.25 * len(image)) : round(0.72 * len(image))])
             cv2.putText(
                 band, f"{name}, image {number + 1}", (12, 30), cv2.FONT_HERSHEY_SIMPLEX, 0.8, (255, 255, 255), 2
             )

@@ -38,7 +38,7 @@ def record(
     path: Path,
     base_from_camera: Matrix,
     world: str = "corridor",
-    pictures: int = 20,
+    images: int = 20,
     size: tuple[int, int] = (1024, 512),
     period_s: float = 0.8,
     twist: tuple[float, float] = (0.2, 0.5),
@@ -54,7 +54,7 @@ def record(
         path: folder of the bag.
         base_from_camera: (4, 4), true pose of the camera.
         world: as for ``make_world``.
-        pictures: number of images.
+        images: number of images.
         size: width and height of an image.
         period_s: time between images.
         twist: m/s and rad/s; (0, 0) stands still.
@@ -77,7 +77,7 @@ def record(
         simulation.drive(*twist)
         next_s, taken, scan_until_s = 0.5, 0, 0.0
         stream: PacketStream | None = None
-        while taken < pictures or simulation.time_s < scan_until_s:
+        while taken < images or simulation.time_s < scan_until_s:
             simulation.step(_STEP_S)
             now_s, now_ns = simulation.time_s, simulation.epoch_ns(simulation.time_s)
             pose = transform_message(simulation.world_from_base(), "odom", "base_link", now_ns)
@@ -85,7 +85,7 @@ def record(
             if stream is None and now_s > next_s - _TURN_S:
                 simulation.scanner.skip_to(now_s - _TURN_S)
                 stream, scan_until_s = PacketStream(), next_s + 0.1
-            if taken < pictures and now_s >= next_s:
+            if taken < images and now_s >= next_s:
                 frame = simulation.renderer.render(simulation.world_from_base() @ base_from_camera, *size)
                 _, jpeg = cv2.imencode(".jpg", frame.rgb[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 92])
                 write("/camera/image/compressed", compressed_image_message(jpeg.tobytes(), "camera", now_ns), now_ns)

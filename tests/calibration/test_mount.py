@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from instant_ic.bag import BagReader, BagWriter
 from instant_ic.bus.node_files import node_class
 from instant_ic.calibration.bag import read_recording
-from instant_ic.calibration.edges import CUES, FloorPlane, find_floor, lidar_edges, picture_edges
+from instant_ic.calibration.edges import CUES, FloorPlane, find_floor, image_edges, lidar_edges
 from instant_ic.calibration.mount import AXES, CalibrationError, CalibrationFrame, calibrate, correction
 from instant_ic.calibration.overlay import before_and_after, overlay
 from instant_ic.cli.main import main
@@ -82,10 +82,10 @@ def test_edges_of_a_made_up_room():
     assert len(lidar_edges(points[:0], intensity[:0], ring[:0], None).cue) == 0
 
 
-def test_picture_edges_of_a_door_at_the_seam():
+def test_image_edges_of_a_door_at_the_seam():
     rgb = np.random.default_rng(0).integers(196, 205, (64, 128, 3)).astype(np.uint8)
     rgb[20:50, :24] = 30  # from the seam to column 24, from row 20 to row 50
-    upright, lying = picture_edges(rgb, 1.0)
+    upright, lying = image_edges(rgb, 1.0)
     assert upright[35, [127, 0, 23, 24]].min() > 4 * upright[35, [8, 12, 60, 100]].max()
     assert lying[[19, 20, 49, 50], 12].min() > 2 * lying[[5, 35, 60], 12].max()
 
@@ -95,12 +95,12 @@ def drive(tmp_path_factory) -> tuple[Path, np.ndarray]:
     """A short drive through a furnished room, the camera 5 cm and 3 degrees from where its mount says."""
     path = tmp_path_factory.mktemp("r") / "drive"
     base_from_camera = perturbed(BASE_FROM_CAMERA, 0.05, 3.0, seed=1)
-    return path, record(path, base_from_camera, "random:900004", pictures=6, size=(512, 256), period_s=1.1)
+    return path, record(path, base_from_camera, "random:900004", images=6, size=(512, 256), period_s=1.1)
 
 
 def test_recording_is_read_with_motion_compensated(drive):
     recording = read_recording(drive[0])
-    assert (recording.pictures, len(recording.frames), recording.moves) == (6, 6, True)
+    assert (recording.images, len(recording.frames), recording.moves) == (6, 6, True)
     assert recording.places >= 3
     np.testing.assert_allclose(recording.camera_from_lidar, inverse(BASE_FROM_CAMERA) @ BASE_FROM_LIDAR, atol=1e-9)
     floor = find_floor(recording.frames[0].points)
@@ -163,7 +163,7 @@ def test_a_bare_room_gives_no_calibration():
         calibrate([bare], np.eye(4), **QUICK)
     with pytest.raises(CalibrationError, match="no pair"):
         calibrate([], np.eye(4), **QUICK)
-    # Edges enough, but the picture shows nothing of them: lens cap on.
+    # Edges enough, but the image shows nothing of them: lens cap on.
     jagged = scan(lambda azimuth, elevation: np.where(np.sin(20 * azimuth) > 0, 2.0, 4.0))
     with pytest.raises(CalibrationError, match="better than chance"):
         calibrate([CalibrationFrame(bare.rgb, *jagged)], np.eye(4), **QUICK)
@@ -206,8 +206,8 @@ def test_overlay_puts_points_where_they_belong():
     points, intensity, ring = scan(lambda azimuth, elevation: np.full(azimuth.shape, 2.0))
     ahead = np.abs(np.arctan2(points[:, 1], points[:, 0])) < math.radians(30)
     frame = CalibrationFrame(np.full((128, 256, 3), 90, np.uint8), points[ahead], intensity[ahead], ring[ahead])
-    picture = overlay(frame, np.eye(4), width=256)
-    coloured = np.ptp(picture.astype(int), axis=2) > 30
+    image = overlay(frame, np.eye(4), width=256)
+    coloured = np.ptp(image.astype(int), axis=2) > 30
     columns = np.flatnonzero(coloured.any(axis=0))
     assert columns.min() == pytest.approx(128 - 30 / 360 * 256, abs=1.5)
     assert columns.max() == pytest.approx(127 + 30 / 360 * 256, abs=1.5)

@@ -55,7 +55,7 @@ def camera_lidar(args: argparse.Namespace) -> int:
             f"{args.bag}: /tf_static has no transform between camera and LiDAR: record it too, or give "
             "--guess X,Y,Z,ROLL,PITCH,YAW"
         )
-    print(f"{recording.pictures} images, {len(recording.frames)} used, from {recording.places} places"
+    print(f"{recording.images} images, {len(recording.frames)} used, from {recording.places} places"
           + ("" if recording.moves else "; no odometry on /tf: the robot is assumed to stand still"),
           flush=True)  # fmt: skip
     result = calibrate(recording.frames, given, not args.near, lambda line: print(line, flush=True))
