@@ -1,4 +1,4 @@
-"""Grid SLAM in the plane: scan matching, keyframes, loop closure, occupancy grid. Arrays in, arrays out.
+"""Grid SLAM in the plane: scan matching, keyframes, loop closure, occupancy grid.
 
 ```python
 from instant_ic.slam import GridSlam, Scan, SlamConfig

@@ -1,7 +1,6 @@
 """Parameters of the grid SLAM: one frozen dataclass per concept. Metres, radians, seconds.
 
-Values that depend on the method alone, not on the robot, the sensor or the place, are constants beside the code that
-uses them.
+Values that depend only on the method, and not on robot, sensor or place, are constants beside the code that uses them.
 """
 
 from __future__ import annotations
@@ -20,7 +19,7 @@ class LikelihoodFieldConfig(Checked):
 
     Attributes:
         resolution_m: cell size; also the translation step of the search.
-        max_range_m: farther hits are not matched.
+        max_range_m: largest range of hits that are matched.
     """
 
     resolution_m: Positive = 0.05
@@ -33,8 +32,8 @@ class MatchConfig(Checked):
 
     Attributes:
         max_points: maximum number of points per scan, evenly chosen; the cost grows with it.
-        free_motion_speed_mps: without odometry: maximum speed of the robot, for the width of the search.
-        free_motion_yaw_rate_radps: without odometry: maximum yaw rate, for the width of the search.
+        free_motion_speed_mps: maximum speed of the robot, which sets the width of the search without odometry.
+        free_motion_yaw_rate_radps: maximum yaw rate, which sets the width of the search without odometry.
     """
 
     max_points: Annotated[int, Range(low=20)] = 240
@@ -48,7 +47,7 @@ class MapConfig:
 
     Attributes:
         resolution_m: cell size of /map.
-        max_range_m: maximum length of a ray entered into the map.
+        max_range_m: maximum length of a ray that is entered into the map.
         max_size_m: maximum side length of the map, centred on the start.
     """
 
@@ -73,12 +72,12 @@ class SlamConfig:
 
 @dataclass(frozen=True)
 class QueueConfig(Checked):
-    """Odometry and time of the scans.
+    """Odometry and age of the scans.
 
     Attributes:
-        use_wheel_odom: false: LiDAR odometry only; the node then broadcasts odom→base_link itself.
-        odom_wait_s: maximum time that a scan waits for the odometry of its stamp.
-        max_scan_age_s: older scans are dropped with a warning; after this time without a scan: ERROR.
+        use_wheel_odom: use wheel odometry. Without it, LiDAR odometry is used and the node broadcasts odom→base_link.
+        odom_wait_s: maximum time for which a scan waits for the odometry of its stamp.
+        max_scan_age_s: age above which scans are dropped with a warning, and time without a scan that is an ERROR.
     """
 
     use_wheel_odom: bool = True
@@ -91,8 +90,8 @@ class GridSlamConfig(SlamConfig, QueueConfig):
     """Parameters of the node ``grid_slam``, in addition to those of the method and of the queue.
 
     Attributes:
-        mode: mapping: make a map, or extend map_file; localization: only localise in map_file.
-        map_file: saved map, NAME or NAME.yaml ("ic map save NAME"); empty: start a new map.
+        mode: ``mapping`` makes a map or extends map_file; ``localization`` only localises in map_file.
+        map_file: saved map, NAME or NAME.yaml ("ic map save NAME"); empty starts a new map.
         map_period_s: minimum period of /map; raise it for slow links.
     """
 
@@ -103,9 +102,9 @@ class GridSlamConfig(SlamConfig, QueueConfig):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.mode == "localization" and not self.map_file:
-            raise ValueError("mode localization needs map_file, the map to drive in")
+            raise ValueError("mode localization needs map_file, the map to localise in")
 
     @property
     def saved_map(self) -> Path | None:
-        """The saved map's file; None starts a new map."""
+        """The saved map's file; None for a new map."""
         return Path(self.map_file).expanduser() if self.map_file else None

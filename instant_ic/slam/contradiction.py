@@ -1,17 +1,17 @@
-"""Decides whether wheel odometry and scan matching contradict each other.
+"""Detection of contradictions between wheel odometry and scan matching.
 
-Each scan gives a step of the wheels and a step seen by the LiDAR: along, across and in rotation.
+Each scan gives a step of the wheels and a step seen by the LiDAR, each with a part along, across and in rotation.
 
-1. Steps are added up until they are a motion of `STEP_M`, or for `STEP_S`: noise is no motion, however slow the robot.
-   Scans in a burst are one step, because their stamps are not the times at which they were measured.
-2. For each of the three and each sign, a cumulative sum (Page, 1954) adds how much farther the robot was seen to move
-   than its tracks. It subtracts what ordinary slip explains, and does not fall below zero. A contradiction begins where
+1. Add up steps until they reach `STEP_M` or have lasted `STEP_S`, so that noise does not count as motion even at low
+   speed. Scans in a burst count as one step, because their stamps are not the times at which they were measured.
+2. For each of the three parts and each sign, a cumulative sum (Page, 1954) adds the difference between the seen motion
+   and the tracks' motion, less what ordinary slip explains. It does not fall below zero. A contradiction begins where
    its sum was last zero.
-3. A contradiction is certain once its sum exceeds the error of the comparison, over several comparisons: that of scan
-   matching, and the motion in half a period, by which the stamps of scans and odometry may differ. It counts after
-   `LONGEST_S` or `LONGEST_M`.
+3. A contradiction is certain once its sum exceeds the error of the comparison in several comparisons. This error covers
+   scan matching and the motion in half a period, by which the stamps of scans and odometry may differ. The
+   contradiction counts after `LONGEST_S` or `LONGEST_M`.
 
-A direction is judged only where the scan itself fixes the pose: along a bare corridor, odometry decides the match.
+A direction is judged only if the scan alone fixes the pose in it. Along a bare corridor, odometry decides the match.
 """
 
 from __future__ import annotations
@@ -22,37 +22,37 @@ from instant_ic.slam.scan import FloatArray
 from instant_ic.util.contradiction import Contradiction
 
 LONGEST_S, LONGEST_M = 0.5, 0.15
-"""Time and distance between wheels and LiDAR over which a contradiction counts."""
+"""Duration of a contradiction, and distance between wheels and LiDAR, above which it counts."""
 STEP_M, STEP_S = 0.01, 0.5
-"""Motion, and time without it, after which the steps so far are compared."""
+"""Motion, or time, after which the steps so far are compared."""
 BURST = 0.5
-"""Share of the usual period below which a scan comes in a burst."""
+"""Share of the usual period below which a scan belongs to a burst."""
 COMPARISONS = 3
-"""Smallest number that must contradict: one bad match, or a late odometry message, moves two steps."""
+"""Smallest number of contradicting comparisons. One bad match or one late odometry message changes two steps."""
 CERTAIN_M, CERTAIN_SIGMAS, CERTAIN_STEPS = 0.02, 4.0, 0.5
-"""Error of a comparison: sum of a constant, standard deviations of the match and usual steps of the robot."""
+"""Terms of a comparison's error: constant, factor on the match's standard deviation, factor on the usual step."""
 USUAL_SCANS = 20
 """Number of scans over which the usual period and step are averaged."""
 MOST = 0.5
-"""Largest part of the error that one comparison adds: a pose that is found again elsewhere is no motion."""
+"""Largest share of the error that one comparison may add, because a pose that jumps is not a motion."""
 LEVER_M = 0.3
 """Metres per radian: half the distance of the tracks."""
 SLIP = np.array([0.5, 0.5, 0.65])
-"""Shares of the tracks' motion that ordinary slip explains; skid steering turns by as little as a third."""
+"""Shares of the tracks' motion that ordinary slip explains. Skid steering may turn by only a third."""
 UNEVEN = 0.1
-"""Share of the way along that tracks differ: it turns the robot, times LEVER_M."""
+"""Difference of the two tracks as a share of the way along. It explains a rotation, times LEVER_M."""
 TURN_SHIFT_M = 0.15
-"""Metres per radian: a robot that turns on the spot also moves, because it does not turn about base_link."""
+"""Metres per radian by which a robot moves while turning on the spot, because it does not turn about base_link."""
 STAND_M_S = 0.003
-"""Speed of the tracks below which they stand."""
+"""Speed below which the tracks count as standing."""
 DRIFT_M_S, STILL_M_S = 0.0005, 0.05
-"""Speeds that are no motion, while the tracks turn and while they stand: sums of errors fade away."""
+"""Speeds that do not count as motion, while the tracks turn and while they stand, so that accumulated errors decay."""
 FIXED = np.array([0.01, 0.01, 0.005])
-"""A direction is judged up to this standard deviation of the scan alone; a bare corridor has 0.02 m along its axis."""
+"""Largest standard deviation of the scan alone at which a direction is judged; along a bare corridor it is 0.02 m."""
 AGREED_M = 0.3
-"""Motion of the tracks in agreement with the LiDAR that ends a contradiction."""
+"""Motion of the tracks in agreement with the LiDAR after which a contradiction ends."""
 _STANDS = 0.1
-"""A motion below this share of the other counts as none."""
+"""Share of the other motion below which a motion counts as none."""
 _TO_M = np.array([1.0, 1.0, LEVER_M])
 
 
@@ -60,8 +60,8 @@ class ContradictionMonitor:
     """Compares the steps of wheels and LiDAR.
 
     Attributes:
-        state: the newest contradiction, until tracks and LiDAR have agreed over `AGREED_M`.
-        count: number of contradictions so far. It grows again if a contradiction lasts.
+        state: newest contradiction; none after tracks and LiDAR have agreed over `AGREED_M`.
+        count: number of contradictions so far. It grows again while a contradiction lasts.
     """
 
     def __init__(self) -> None:
@@ -73,30 +73,30 @@ class ContradictionMonitor:
         self._restart()
 
     def _begin_step(self) -> None:
-        # Steps of wheels and LiDAR, (2, 3); rotation times LEVER_M.
+        # Rows: wheels and LiDAR; columns: along, across, rotation times LEVER_M.
         self._step_m, self._step_s, self._step_judged = np.zeros((2, 3)), 0.0, np.ones(3, np.bool_)
 
     def _restart(self) -> None:
-        # Rows: more and less than the tracks; columns: along, across, rotation times LEVER_M.
+        # Rows: seen motion above and below the tracks'; columns: along, across, rotation times LEVER_M.
         self._sum, self._apart_m, self._seconds = np.zeros((2, 3)), np.zeros((2, 3)), np.zeros((2, 3))
         self._wheels_m, self._seen_m = np.zeros((2, 3)), np.zeros((2, 3))
         self._comparisons = np.zeros((2, 3))
 
     def update(self, wheels: FloatArray, seen: FloatArray, elapsed_s: float, scan_sigma: FloatArray | None) -> None:
-        """Add a step; one that is not finite is left out, for it would end the watch.
+        """Add a step. A non-finite step is ignored, because it would make the sums invalid.
 
         Args:
             wheels: odometry step (3,) in the base's frame.
             seen: matched step (3,).
             elapsed_s: duration of the step.
-            scan_sigma: standard deviations (3,) of the match by the scan alone; None if the scan was not matched.
+            scan_sigma: standard deviations (3,) of the match without odometry; None if the scan was not matched.
         """
         sigma = np.full(3, np.inf) if scan_sigma is None else scan_sigma
         judged = sigma < FIXED
         step_m = np.stack([wheels, np.where(judged, seen, wheels)]) * _TO_M
         if not (np.isfinite(step_m).all() and 0.0 <= elapsed_s < np.inf):
             return
-        # One pause, or one pose that jumps, hardly changes what is usual.
+        # Limit the outliers, so that a single pause or jump hardly changes the usual values.
         pause_s = 4.0 * self._period_s if self._scans else elapsed_s
         self._scans = min(self._scans + 1, USUAL_SCANS)
         self._period_s += (min(elapsed_s, pause_s) - self._period_s) / self._scans
@@ -111,7 +111,7 @@ class ContradictionMonitor:
             self._begin_step()
 
     def _compare(self, error_m: FloatArray) -> None:
-        """Compare wheels and LiDAR over a step; ``error_m`` (3,) is that of the comparison."""
+        """Compare wheels and LiDAR over a step; ``error_m`` (3,) is the error of the comparison."""
         (wheels_m, seen_m), elapsed_s = self._step_m, self._step_s
         stand = float(np.abs(wheels_m).sum()) < STAND_M_S * elapsed_s
         explained = SLIP * np.abs(wheels_m) + (STILL_M_S if stand else DRIFT_M_S) * elapsed_s

@@ -1,4 +1,4 @@
-"""Poses of the base in the map and in odometry over time, and the transform between the two frames."""
+"""Poses of the base in the map and in odometry, and the transform between the two frames."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from instant_ic.slam.front_end import FrontEnd, Guess
 from instant_ic.slam.scan import FloatArray
 
 MAX_ODOMETRY_GAP_S = 5.0
-"""The encoders keep counting across a shorter gap; after a longer one they may have been reset."""
+"""Longest gap in odometry that is bridged. After a longer one, the encoders may have been reset."""
 
 
 class ScanStep(NamedTuple):
-    """Motion from the scan before to this one.
+    """Motion from the previous scan to this one.
 
     Attributes:
-        motion: motion by scan matching, in the frame of the pose before, (3,).
-        wheels: the same motion by odometry; None unless both scans came with odometry.
+        motion: motion from scan matching, in the frame of the previous pose, (3,).
+        wheels: the same motion from odometry; None unless both scans have odometry.
         elapsed_s: time between the scans.
     """
 
@@ -30,10 +30,10 @@ class ScanStep(NamedTuple):
 
 
 class BaseFrames:
-    """Predicts the pose of the next scan, and takes its result over.
+    """Predicts the pose of each scan and takes over the matched pose.
 
-    `map_from_odom` takes up all corrections. `odom_from_base` is the given odometry; for scans without odometry it is
-    LiDAR odometry continued from there.
+    `map_from_odom` absorbs all corrections. `odom_from_base` is the given odometry. For scans without odometry, LiDAR
+    odometry continues it.
 
     Attributes:
         map_from_base: pose of the last scan, (3,).
@@ -49,7 +49,7 @@ class BaseFrames:
         self.stamp_ns: int | None = None
         self._step: FloatArray = np.zeros(3)
         self._step_s = 0.0
-        # Odometry and map pose at the last scan that came with odometry.
+        # Stamp, odometry and map pose of the last scan with odometry.
         self._odometry_stamp_ns: int | None = None
         self._odometry_pose: FloatArray = np.zeros(3)
         self._pose_at_odometry: FloatArray = np.zeros(3)
@@ -59,7 +59,7 @@ class BaseFrames:
         return 0.0 if self.stamp_ns is None else (stamp_ns - self.stamp_ns) * 1e-9
 
     def predict(self, front_end: FrontEnd, odometry: FloatArray | None, stamp_ns: int) -> Guess:
-        """Predict the pose of a scan by odometry (3,), or by constant velocity without it."""
+        """Predict the pose of a scan from odometry (3,), or with constant velocity if there is none."""
         if self.stamp_ns is None:
             start = np.zeros(3) if odometry is None else odometry
             return front_end.guess_from_odometry(start, np.zeros(3))
@@ -72,16 +72,16 @@ class BaseFrames:
         return front_end.guess_from_velocity(pose, elapsed_s)
 
     def follow(self, pose: FloatArray, matched: bool, odometry: FloatArray | None, stamp_ns: int) -> ScanStep | None:
-        """Accept the pose (3,) of a scan and move its correction into map_from_odom.
+        """Accept the pose of a scan and put its correction into map_from_odom.
 
         Args:
             pose: map_from_base of the scan, (3,).
             matched: whether the pose comes from scan matching.
-            odometry: odom_from_base of the scan, (3,); None without.
+            odometry: odom_from_base of the scan, (3,); None without odometry.
             stamp_ns: time of the scan.
 
         Returns:
-            The motion since the scan before; None for the first scan.
+            The motion since the previous scan; None for the first scan.
         """
         step, scan_step = relative2(self.map_from_base, pose), None
         if self.stamp_ns is not None:
@@ -90,7 +90,7 @@ class BaseFrames:
                 wheels = relative2(self._odometry_pose, odometry)
             self._step_s = self.elapsed_s(stamp_ns)
             scan_step = ScanStep(step, wheels, self._step_s)
-            # Damp the velocity: without a match, the estimate must not keep moving for ever.
+            # Damp the velocity, so that the estimate does not keep moving without a match.
             self._step = step if matched else 0.5 * step
         if odometry is None:
             self.odom_from_base = compose2(self.odom_from_base, step)
@@ -102,7 +102,7 @@ class BaseFrames:
         return scan_step
 
     def move(self, moved: FloatArray) -> None:
-        """Move the current pose in the map by ``moved`` (3,); odometry stays."""
+        """Move the current pose in the map by ``moved`` (3,). Odometry stays unchanged."""
         self.map_from_base = compose2(moved, self.map_from_base)
         self.map_from_odom = compose2(moved, self.map_from_odom)
         self._pose_at_odometry = compose2(moved, self._pose_at_odometry)

@@ -1,9 +1,9 @@
-"""Front end: matches each scan against the local map of recent keyframes.
+"""Front end, which matches each scan against the local map of recent keyframes.
 
-1. ``guess_from_odometry``, ``guess_from_velocity``: the predicted pose, its uncertainty, and the window to search.
-2. ``track``: match the scan in that window; then, if the score is poor, in a wide window; then, in doubt, at all
-   headings (``_search_all_headings``).
-3. ``_add_keyframe``: a scan that has moved far enough becomes a keyframe, and the local map is rebuilt.
+1. ``guess_from_odometry``, ``guess_from_velocity``: predict the pose, its uncertainty and the search window.
+2. ``track``: match the scan in this window. If the score is poor, match it in a wide window. If the match is still in
+   doubt, search all headings (``_search_all_headings``).
+3. ``_add_keyframe``: make a keyframe of a scan that is far enough from the last one, and rebuild the local map.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from instant_ic.slam.matcher import Match, SearchWindow, match_scan
 from instant_ic.slam.scan import FloatArray, ScanPoints, thin
 
 MIN_POINTS = 20
-"""A scan with fewer points is not matched; odometry decides."""
+"""Smallest number of points with which a scan is matched; with fewer, its pose is odometry's."""
 
 
 @dataclass(frozen=True)
@@ -32,38 +32,36 @@ class FrontEndConfig:
     """Tuning of the front end.
 
     Attributes:
-        search_m: half width of the search around the predicted pose in metres; it grows with the odometry step.
+        search_m: half width of the search around the predicted pose, in metres; it grows with the odometry step.
         search_rad: the same for the heading, in radians.
-        recovery_m: half width of the wide search in metres.
+        recovery_m: half width of the wide search, in metres.
         recovery_rad: the same for the heading, in radians.
         recovery_score: score below which the wide search starts.
-        min_score: score below which the scan counts as lost: its pose is odometry's.
-        recovery_margin: least gain of the wide search's score over the first search's.
-        start_keyframes: most keyframes taken at the start pose before the robot moves.
-        wide_gain: share of the residual that a pose found over all headings must explain, of the local match's
-            and of the second best place's.
-        score_memory: weight of a scan in the usual score.
-        score_drop: a score this much below the usual one is in doubt.
-        doubtful_turn_rad: standard deviation of a heading by odometry, that of a turn of 40° in one scan, above
-            which the match is in doubt at any score.
-        wide_sigmas: reach of the search over all headings, in standard deviations of the guess since the last
-            match.
-        wide_reach_m: limit of that reach in metres.
-        window_per_m: growth of the search window per metre of the odometry step; as the next two, twice its
-            standard deviation.
+        min_score: score below which the scan counts as lost and gets odometry's pose.
+        recovery_margin: smallest gain of the wide search's score over the first search's.
+        start_keyframes: largest number of keyframes at the start pose before the robot moves.
+        wide_gain: smallest share of the residual, of the local match and of the second best place, that a pose found
+            over all headings must explain.
+        score_memory: weight of a new scan in the usual score.
+        score_drop: drop below the usual score at which a match is in doubt.
+        doubtful_turn_rad: standard deviation of odometry's heading above which a match is in doubt at any score;
+            reached by a turn of 40° in one scan.
+        wide_sigmas: reach of the search over all headings, in standard deviations of odometry since the last match.
+        wide_reach_m: limit of this reach, in metres.
+        window_per_m: growth of the search window per metre of the odometry step. This and the next two are twice the
+            standard deviation of odometry.
         window_per_rad: growth of the window's rotation per radian.
         turn_window_per_m: growth of the window's rotation per metre.
-        floor_sigma_m: standard deviation of an odometry step in metres, also while standing.
+        floor_sigma_m: smallest standard deviation of an odometry step, in metres; also while standing.
         floor_sigma_rad: the same for the heading, in radians.
-        sigma_m_per_m: growth of the standard deviation per metre: tracks slip.
-        sigma_rad_per_rad: growth of the heading's per radian: skid steering turns less than the encoders.
-        sigma_rad_per_m: growth of the heading's per metre.
+        sigma_m_per_m: growth of the position's standard deviation per metre, because tracks slip.
+        sigma_rad_per_rad: growth of the heading's standard deviation per radian, because skid steering slips in turns.
+        sigma_rad_per_m: growth of the heading's standard deviation per metre.
         keyframe_m: motion since the last keyframe after which a scan becomes a keyframe, in metres.
         keyframe_rad: the same for the heading, in radians.
         step_sigma_m: scan-matching error between keyframes beyond its own covariance, in metres.
         step_sigma_rad: the same for the heading, in radians.
-        known_map_step_m: distance after which the local map is rebuilt when localising in a known map, in
-            metres.
+        known_map_step_m: motion after which the local map of a known map is rebuilt, in metres.
     """
 
     search_m: float = 0.3
@@ -102,19 +100,19 @@ class SlamStatus(enum.StrEnum):
     """Outcome of processing a scan."""
 
     FIRST = "first"
-    """The first scan: the origin of the map."""
+    """First scan, which is the origin of the map."""
     TRACKED = "tracked"
-    """Matched near the predicted pose."""
+    """Match near the predicted pose."""
     RECOVERED = "recovered"
-    """Matched by the wide search; the odometry error was large."""
+    """Match by the wide search, because the odometry error was large."""
     LOST = "lost"
-    """No match; the pose comes from odometry, and its covariance grows."""
+    """No match. The pose comes from odometry, and its covariance grows."""
     RESTARTED = "restarted"
-    """The robot is lost; a new session starts at the odometry pose, apart from the map so far."""
+    """Lost robot. A new session starts at the odometry pose, with a map of its own."""
     NO_POINTS = "no points"
-    """No points, only infinite ranges, or too few points; the pose comes from odometry."""
+    """Too few points. The pose comes from odometry."""
     TIME_BACKWARDS = "time backwards"
-    """Not newer than the previous scan; the scan is ignored and the last pose returned."""
+    """Scan that is not newer than the previous one. It is ignored, and the last pose is returned."""
 
     @property
     def matched(self) -> bool:
@@ -127,10 +125,10 @@ class Guess:
     """Predicted pose of the base, from odometry or constant velocity.
 
     Attributes:
-        pose: (3,).
-        sigma: (3,) along, across, rotation.
+        pose: map_from_base, (3,).
+        sigma: standard deviations along, across and in rotation, (3,).
         window: search window around the pose.
-        doubtful: whether odometry reports a turn so large that its tracks may have slipped.
+        doubtful: true if odometry reports a turn so large that the tracks may have slipped.
     """
 
     pose: FloatArray
@@ -144,12 +142,12 @@ class Track:
     """Result of the front end for one scan.
 
     Attributes:
-        pose: (3,).
-        covariance: (3, 3) of the pose.
-        score: 0..1, mean field value over the points.
+        pose: map_from_base, (3,).
+        covariance: covariance of the pose, (3, 3).
+        score: mean field value over the points, 0..1.
         status: outcome of the scan.
-        keyframe: the keyframe that was added; None if none was.
-        scan_covariance: (3, 3) of the pose by the scan alone; None if the pose is not that of a match.
+        keyframe: keyframe that was added, or None.
+        scan_covariance: covariance of the match without odometry, (3, 3); None without a match.
     """
 
     pose: FloatArray
@@ -161,7 +159,7 @@ class Track:
 
     @property
     def scan_sigma(self) -> FloatArray | None:
-        """Standard deviations (3,) by the scan alone: along, across, rotation; None without a match."""
+        """Standard deviations of the match without odometry (3,): along, across, rotation; None without a match."""
         if self.scan_covariance is None:
             return None
         sigma: FloatArray = np.sqrt(np.diag(turned(self.scan_covariance, -float(self.pose[2]))))
@@ -187,16 +185,16 @@ class FrontEnd:
 
     @property
     def in_known_map(self) -> bool:
-        """True if scans are matched against a known map that stays unchanged."""
+        """True if scans are matched against a known map, which stays unchanged."""
         return self._known is not None
 
     def use_known_map(self, points: FloatArray, pose: FloatArray) -> None:
-        """Switch to matching against the surfaces (n, 2) of a known map, starting at ``pose`` (3,)."""
+        """Match against the surface points (n, 2) of a known map from now on, starting at ``pose`` (3,)."""
         self._known = points
         self._build_known(pose)
 
     def guess_from_odometry(self, pose: FloatArray, step: FloatArray) -> Guess:
-        """Return the guess at ``pose`` after an odometry step (3,) in the base's own frame."""
+        """Return the guess at ``pose``, which an odometry step (3,) in the base's own frame has led to."""
         distance, turn = math.hypot(step[0], step[1]), abs(step[2])
         translation = TUNING.floor_sigma_m + TUNING.sigma_m_per_m * distance
         rotation = TUNING.floor_sigma_rad + TUNING.sigma_rad_per_rad * turn + TUNING.sigma_rad_per_m * distance
@@ -205,7 +203,7 @@ class FrontEnd:
         return self._guess(pose, translation, rotation, window_m, window_rad, rotation > TUNING.doubtful_turn_rad)
 
     def guess_from_velocity(self, pose: FloatArray, elapsed_s: float) -> Guess:
-        """Return the guess at ``pose`` without odometry: the window covers any motion possible in the elapsed time."""
+        """Return the guess at ``pose`` without odometry. Its window covers any motion possible in the elapsed time."""
         match = self.config.match
         translation = 0.5 * match.free_motion_speed_mps * elapsed_s + 0.05
         rotation = 0.5 * match.free_motion_yaw_rate_radps * elapsed_s + 0.05
@@ -214,7 +212,7 @@ class FrontEnd:
     def constant_velocity(self, pose: FloatArray, step: FloatArray, step_s: float, elapsed_s: float) -> FloatArray:
         """Return the pose after ``elapsed_s`` at the velocity of the last ``step`` (3,), which took ``step_s`` seconds.
 
-        The velocity is at most ``match.free_motion_*``: stamps of a few milliseconds would make it arbitrarily large.
+        The velocity is limited to ``match.free_motion_*``, because stamps a few milliseconds apart could make it huge.
         """
         match = self.config.match
         part = elapsed_s / step_s if step_s > 0 else 0.0
@@ -233,9 +231,9 @@ class FrontEnd:
     def track(
         self, scan: ScanPoints, guess: Guess, stamp_ns: int, accept: Callable[[FloatArray, float, bool], bool]
     ) -> Track:
-        """Match a scan that has at least `MIN_POINTS` points; it becomes a keyframe only if ``accept`` returns True.
+        """Match a scan of at least `MIN_POINTS` points. It can become a keyframe only if ``accept`` returns True.
 
-        ``accept`` gets the pose (3,) and the score of the match, and whether only the wide search has found it.
+        ``accept`` gets the pose (3,) and the score of the match, and whether only a wide search has found it.
         """
         points = self._match_points(scan)
         if not self.trajectory:
@@ -248,8 +246,8 @@ class FrontEnd:
             recovered = match_scan(
                 self._field, points, guess.pose, guess.sigma, SearchWindow(TUNING.recovery_m, TUNING.recovery_rad)
             )
-            # Unless the first window was too small, the wide search must be clearly better: a window this large always
-            # contains a slightly better pose.
+            # A window this large always contains a slightly better pose. The wide search must therefore be clearly
+            # better, unless the first window was too small.
             margin = 0.0 if match.at_border else TUNING.recovery_margin
             if recovered.score >= TUNING.min_score and recovered.score > match.score + margin:
                 match, status = recovered, SlamStatus.RECOVERED
@@ -290,12 +288,12 @@ class FrontEnd:
         return thin(scan.points[near], scan.joined[near], self.config.match.max_points)
 
     def _doubtful(self, match: Match, guess: Guess) -> bool:
-        """Return whether the scan may fit better at a heading that the local search does not reach."""
+        """Return whether the scan may fit better at a heading outside the local search."""
         usual = max(TUNING.recovery_score, self._usual_score - TUNING.score_drop)
         return match.at_border or match.score < usual or guess.doubtful
 
     def _search_all_headings(self, points: FloatArray, guess: Guess, score: float) -> Match | None:
-        """Return the best pose over all headings near the guess; None unless unique and better than ``score``."""
+        """Return the best pose over all headings near the guess, or None unless it is unique and beats ``score``."""
         found = find_place(self._field, points, guess.pose, self.reach_m(guess), math.pi)
         if found is None or found.score < TUNING.recovery_score:
             return None
@@ -305,21 +303,21 @@ class FrontEnd:
         return Match(found.pose, found.covariance, found.score, False, found.covariance)
 
     def reach_m(self, guess: Guess) -> float:
-        """Return the distance from the guess within which the robot is, by odometry since the last match."""
+        """Return the distance from the guess within which the robot must be, by odometry since the last match."""
         sigma_m = float(guess.sigma[0]) + self._lost_sigma_m
         return min(TUNING.recovery_m + TUNING.wide_sigmas * sigma_m, TUNING.wide_reach_m)
 
     def _grown_covariance(self, guess: Guess) -> FloatArray:
-        # Odometry errs by its scale: the errors of the steps without a match add up.
+        # Odometry has a scale error, so the standard deviations of steps without a match add up.
         self._lost_sigma_m += float(guess.sigma[0])
         self._covariance = self._covariance + turned(np.diag(guess.sigma**2), float(guess.pose[2]))
         return self._covariance
 
     def _first_was_poor(self, match: Match, status: SlamStatus) -> bool:
-        """Return whether a robot that has not moved since the start sees more than its map holds.
+        """Return whether the first keyframes hold too little of what the robot sees at its start.
 
-        This happens when the first scan covered half a revolution, before odometry arrived. Without a further keyframe,
-        each scan would start a wide search until the robot moves.
+        This happens if the first scan covered only half a revolution. Without a further keyframe, each scan would start
+        a wide search until the robot moves.
         """
         few = len(self.trajectory) < TUNING.start_keyframes
         return few and status is SlamStatus.TRACKED and match.score < TUNING.recovery_score
@@ -344,7 +342,7 @@ class FrontEnd:
         return keyframe
 
     def rebuild_field(self) -> None:
-        """Rebuild the local map from the recent keyframes, for example after their poses were optimised."""
+        """Rebuild the local map from the recent keyframes, for example after the optimisation of their poses."""
         if self._known is not None:
             self._build_known(self._built_at)
             return

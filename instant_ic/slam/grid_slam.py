@@ -1,16 +1,16 @@
-"""Grid SLAM: takes scans and odometry, returns pose, map and map→odom.
+"""Grid SLAM: pose, map and map→odom from scans and odometry.
 
 `GridSlam.process` handles a scan:
 
-1. ``scan_points``: points of the scan in the base frame.
-2. ``frames.predict``: the pose by odometry, or by constant velocity.
-3. ``_match``: the pose by matching the scan to the local map (``front_end``); a lost robot begins a new session
-   (``_new_session``), apart from its map, until it is found in it (``relocalization``).
-4. ``_insert``: a keyframe's scan enters the map.
-5. ``frames.follow``: the correction of the pose moves map→odom.
-6. ``_result``: covariance, and the probability that the pose is wrong (``integrity``).
+1. ``scan_points``: convert the scan to points in the base frame.
+2. ``frames.predict``: predict the pose from odometry, or with constant velocity.
+3. ``_match``: match the scan to the local map (``front_end``). A lost robot starts a new session (``_new_session``)
+   with a map of its own, until it is found in the previous map (``relocalization``).
+4. ``_insert``: add a keyframe's scan to the map.
+5. ``frames.follow``: put the correction of the pose into map→odom.
+6. ``_result``: compute the covariance and the probability that the pose is wrong (``integrity``).
 
-Loop closure, or the search in a saved map, runs beside it (`GridSlam.background_job`).
+Loop closure and the search in a saved map run in the background (`GridSlam.background_job`).
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ from instant_ic.slam.scan import FloatArray, Scan, ScanPoints, scan_points
 from instant_ic.slam.turn_factor import TurnFactor
 
 PROVISIONAL_KEYFRAMES = 8
-"""Number of provisional keyframes after a sign of a loss; over a longer way a right pose drifts as well."""
+"""Number of provisional keyframes after a sign of a loss. Over a longer way, even a right pose drifts."""
 
 
 @dataclass(frozen=True)
@@ -48,15 +48,14 @@ class SlamResult:
     """Result of one scan.
 
     Attributes:
-        map_from_base: (3,) at the scan's stamp.
-        covariance: (3, 3) x, y, yaw in the map frame: match covariance plus drift since the last loop closure, wider
-            the less the pose is trusted.
-        score: 0..1, mean likelihood field value over the points.
+        map_from_base: pose at the scan's stamp, (3,).
+        covariance: covariance of x, y, yaw in the map frame, (3, 3): that of the match plus the drift since the last
+            loop closure, wider if the pose is less trusted.
+        score: mean likelihood field value over the points, 0..1.
         status: outcome of the scan.
-        keyframe_added: whether the map has changed.
-        anchor: newest keyframe, which moves with the map: this scan's pose can be read after later corrections; None
-            before the first keyframe.
-        localized: False while the robot is not yet located in a saved map, or is lost; the pose is then in a separate
+        keyframe_added: whether the scan has become a keyframe.
+        anchor: newest keyframe; None before the first. Later corrections move it, and with it this scan's pose.
+        localized: False while the robot is lost or not yet located in a saved map; the pose is then in a separate
             frame.
         integrity: probability of being lost, and bounds of the error.
     """
@@ -78,12 +77,12 @@ class SlamResult:
 
 @dataclass
 class _MapBefore:
-    """The state before a sign of a loss.
+    """State of the map before a sign of a loss.
 
     Attributes:
         map: the map at that time.
-        keyframes: number of its keyframes.
-        since: number of keyframes since.
+        keyframes: number of keyframes in this map.
+        since: number of keyframes added since.
     """
 
     map: OccupancyMap
@@ -97,18 +96,18 @@ class GridSlam:
     The first scan's pose is the odometry pose, or the origin without odometry.
 
     Args:
-        config: defaults when None.
-        saved: a map to localise in or to extend. Until the robot is located in it, it maps in a separate frame.
+        config: parameters; None uses the defaults.
+        saved: map to localise in or to extend. Until the robot is located in it, it maps in a separate frame.
 
     Attributes:
         map: the map being made.
-        in_map_frame: whether the pose continues one in the map's frame; False until the place in a saved map is found.
+        in_map_frame: False until the robot has first been located in a saved map; its poses are then not in the map.
         frames: poses in the map and in odometry.
         front_end: matches scans and makes keyframes.
         loop_closure: finds loops and optimises the keyframes' poses.
-        turn_factor: encoder yaw over true yaw.
-        contradiction: whether wheel odometry and scan matching contradict each other.
-        monitor: probability of being lost.
+        turn_factor: estimates encoder yaw over true yaw.
+        contradiction: detects contradictions between wheel odometry and scan matching.
+        monitor: estimates the probability of being lost.
     """
 
     def __init__(self, config: SlamConfig | None = None, saved: SavedMap | None = None) -> None:
@@ -122,10 +121,10 @@ class GridSlam:
         self.monitor = IntegrityMonitor()
         self.in_map_frame = saved is None
         self._relocalization = None if saved is None else Relocalization(saved)
-        self._before: _MapBefore | None = None  # until a sign of a loss has been examined
+        self._before: _MapBefore | None = None  # set while a sign of a loss is examined
         self._covariance: FloatArray = np.zeros((3, 3))
         self._points: ScanPoints | None = None
-        # Background work: keyframes handed to the loop closure, whether a job is running, whether one has failed.
+        # Background work: number of keyframes handed over, whether a job is running, its session, whether one failed.
         self._handed_over = 0
         self._busy = False
         self._job_of = self.front_end.trajectory
@@ -136,11 +135,11 @@ class GridSlam:
     def process(
         self, scan: Scan, odom_pose: ArrayLike | None = None, base_from_laser: ArrayLike = (0.0, 0.0, 0.0)
     ) -> SlamResult:
-        """Estimate the pose of a scan, and add the scan to the map when it is a keyframe.
+        """Estimate the pose of a scan, and add the scan to the map if it is a keyframe.
 
         Args:
-            scan: newer than the previous one.
-            odom_pose: odom_from_base (3,) at the scan's stamp, or None.
+            scan: scan to process; ignored if it is not newer than the previous one.
+            odom_pose: odom_from_base (3,) at the scan's stamp; None without odometry.
             base_from_laser: mounting pose of the laser on the robot, (3,).
         """
         if self.frames.stamp_ns is not None and scan.stamp_ns <= self.frames.stamp_ns:
@@ -153,7 +152,7 @@ class GridSlam:
         guess = self.frames.predict(self.front_end, odometry, scan.stamp_ns)
         if len(points.points) >= MIN_POINTS:
             track = self._match(points, guess, scan.stamp_ns)
-        elif self.frames.stamp_ns is None:  # nothing to match against yet: the next scan becomes the first one
+        elif self.frames.stamp_ns is None:  # there is nothing to match against yet, so a later scan becomes the first
             return self._unplaced(SlamStatus.NO_POINTS)
         else:
             track = self.front_end.dead_reckon(guess)
@@ -163,7 +162,7 @@ class GridSlam:
         return self._result(track)
 
     def _match(self, points: ScanPoints, guess: Guess, stamp_ns: int) -> Track:
-        """Match a scan. While the pose is in doubt no scan enters the map; a lost robot starts a new session."""
+        """Match a scan. While the pose is in doubt, no scan enters the map. A lost robot starts a new session."""
         elapsed_s = self.frames.elapsed_s(stamp_ns)
 
         def accept(pose: FloatArray, score: float, recovered: bool) -> bool:
@@ -172,7 +171,7 @@ class GridSlam:
             moved_m = math.hypot(step[0], step[1]) + 0.5 * abs(float(step[2]))
             self.monitor.matched(contradicted, score, elapsed_s, recovered, moved_m)
             if self._before is not None:
-                # Compare with the local map only: older parts may contradict a right pose, which has drifted.
+                # Compare with recent scans only, because older parts of the map may contradict a pose that has drifted.
                 before = self._before.map.contradiction(pose, points, LOCAL_KEYFRAMES)
                 self.monitor.compared(before - contradicted, moved_m)
             return not self.monitor.doubts
@@ -183,7 +182,7 @@ class GridSlam:
         return self._new_session(points, guess, stamp_ns) if self.monitor.lost else track
 
     def _insert(self, track: Track) -> None:
-        """Add a keyframe's scan to the map. At a sign of a loss the map before it is kept for some metres."""
+        """Add a keyframe's scan to the map. At a sign of a loss, keep a copy of the map before it for some metres."""
         keyframe = track.keyframe
         if self._before is None and self.monitor.sign and not self.front_end.in_known_map:
             self._before = _MapBefore(self.map.copy(), len(self.front_end.trajectory) - (keyframe is not None))
@@ -195,7 +194,7 @@ class GridSlam:
                 self._settle()
 
     def _follow(self, track: Track, odometry: FloatArray | None, stamp_ns: int) -> None:
-        """Accept the pose, and compare the motion with that of the wheels."""
+        """Accept the pose, and compare the motion with the wheels' motion."""
         matched = track.status in (SlamStatus.TRACKED, SlamStatus.RECOVERED)
         step = self.frames.follow(track.pose, matched, odometry, stamp_ns)
         self._covariance = track.covariance
@@ -214,7 +213,7 @@ class GridSlam:
         return SlamResult(track.pose, covariance, track.score, track.status, added, anchor, self.localized, integrity)
 
     def _unplaced(self, status: SlamStatus) -> SlamResult:
-        """Return the result of a scan that changes nothing: the last pose."""
+        """Return the last pose as the result of a scan that changes nothing."""
         return SlamResult(self.map_from_base, self._covariance, 0.0, status, False, localized=self.localized)
 
     # -- poses and map ----------------------------------------------------------------------------
@@ -226,21 +225,21 @@ class GridSlam:
 
     @property
     def saved(self) -> SavedMap | None:
-        """A map in which the robot is located, or searched for; None while it makes its first map."""
+        """The map in which the robot is located or searched for; None while it makes its first map."""
         return None if self._relocalization is None else self._relocalization.saved
 
     @property
     def localized(self) -> bool:
-        """True if the robot is located in the saved map, or there is none."""
+        """True if the robot is located in the saved map, or if there is no saved map."""
         return self.saved is None or self.saved.located
 
     def grid(self) -> OccupancyGrid:
-        """Return the map: int8 array (H, W) of −1, 0..100, resolution, origin (2,)."""
+        """Return the current map."""
         return self.saved.grid if self.saved is not None and self.saved.unchanged else self.map.grid()
 
     @property
     def map_version(self) -> int:
-        """Counter that grows when `grid` changes; 0 before there is a map."""
+        """Counter that grows whenever `grid` changes; 0 before there is a map."""
         return 1 if self.saved is not None and self.saved.unchanged else self.map.version
 
     def figures(self) -> dict[str, object]:
@@ -259,15 +258,15 @@ class GridSlam:
         """
         files = save_grid(stem, self.grid())
         if self.saved is not None and self.saved.unchanged:
-            return files  # this map was loaded, and its graph, if any, exists where it came from
+            return files  # the map was loaded and is unchanged, so its graph, if any, exists beside the loaded file
         return [*files, save_graph(stem, *self._graph())]
 
     def _graph(self, count: int | None = None) -> tuple[list[ScanKeyframe], list[Edge]]:
-        """Return the first ``count`` keyframes, or all, that have not been removed, and the edges between them."""
+        """Return the keyframes that have not been removed, of the first ``count`` or of all, and their edges."""
         keyframes = self.front_end.trajectory[:count]
         edges = [edge for edge in self._edges if max(edge.a, edge.b) < len(keyframes)]
         known = max((edge.b for edge in edges), default=0) + 1
-        for k in range(known, len(keyframes)):  # keyframes that the loop closure has not processed yet
+        for k in range(known, len(keyframes)):  # keyframes that loop closure has not processed yet
             edges.append(Edge(k - 1, k, keyframes[k].step, keyframes[k].step_covariance))
         kept = [k for k, keyframe in enumerate(keyframes) if keyframe.merged_into is None]
         row = {k: index for index, k in enumerate(kept)}
@@ -275,7 +274,7 @@ class GridSlam:
         return [keyframes[k] for k in kept], edges
 
     def _matched_map(self) -> OccupancyMap:
-        """Return the map that scans are matched in."""
+        """Return the map in which scans are matched."""
         known = self.front_end.in_known_map and self._relocalization is not None
         return self._relocalization.cells if known else self.map  # type: ignore[union-attr]
 
@@ -286,13 +285,13 @@ class GridSlam:
         for keyframe in self.front_end.trajectory[count:]:
             self.map.insert(keyframe.map_from_base, keyframe.scan)
 
-    # -- loop closure and search, beside the scans --------------------------------------------------
+    # -- loop closure and search in the background --------------------------------------------------
 
     def background_job(self) -> Callable[[], FoundPlace | LoopOutcome] | None:
-        """Return pending work, which may run on another thread; pass its result to `take_over`.
+        """Return pending work, which may run on another thread. Pass its result to `take_over`.
 
-        That is the loop closure for the keyframes since the last job, or the search in the saved map. None if there are
-        no new keyframes, or a job is still running.
+        The job is loop closure for the keyframes since the last job, or the search in the saved map. None if there is
+        no work, or a job is still running.
         """
         if self._busy:
             return None
@@ -311,15 +310,15 @@ class GridSlam:
         return job
 
     def take_over(self, outcome: FoundPlace | LoopOutcome | None) -> None:
-        """Apply the result of a background job: corrected poses change map_from_odom, never odometry.
+        """Apply the result of a background job. Corrections change map_from_odom, never odometry.
 
         Args:
-            outcome: result of the job; None if it failed. Then nothing changes, and loop closure is disabled, because
-                its copy of the keyframes is incomplete.
+            outcome: result of the job; None if the job failed. Loop closure is then disabled, because its copy of the
+                keyframes is incomplete.
         """
         self._busy = False
         if self._job_of is not self.front_end.trajectory:
-            return  # the job belongs to the session before
+            return  # the job belongs to the previous session
         if outcome is None:
             self._broken = self.localized
         elif isinstance(outcome, LoopOutcome):
@@ -346,7 +345,7 @@ class GridSlam:
         if self._before is not None:
             first = self._before.keyframes
             if outcome.poses is not None or any(edge.robust and edge.b >= first for edge in outcome.edges):
-                self._settle()  # a loop has recognized the place
+                self._settle()  # a loop confirms the place
         moved = outcome.apply(keyframes)
         if moved is not None:
             self.front_end.rebuild_field()
@@ -359,10 +358,10 @@ class GridSlam:
     # -- sessions -----------------------------------------------------------------------------------
 
     def set_pose(self, map_from_base: ArrayLike) -> None:
-        """Set the robot's pose in the saved map (3,). An error of 1 m and 60° is acceptable; scan matching refines it.
+        """Set the robot's pose (3,) in the saved map. Scan matching corrects an error of up to 1 m and 60°.
 
         Raises:
-            ValueError: no saved map, no scan yet, or a pose that is not finite.
+            ValueError: there is no saved map or no scan yet, or the pose is not finite.
         """
         pose = np.asarray(map_from_base, dtype=np.float64)
         if not np.isfinite(pose).all():
@@ -378,21 +377,21 @@ class GridSlam:
             self.front_end.use_known_map(self.saved.localizer.points, self.map_from_base)
 
     def _settle(self) -> None:
-        """Make the scans since the sign of a loss part of the map for good."""
+        """Accept the provisional scans since the sign of a loss as part of the map."""
         self._before = None
         self.monitor.settled()
 
     def _new_session(self, points: ScanPoints, guess: Guess, stamp_ns: int) -> Track:
-        """Leave the map as it is and map apart from it, until the robot is found in it."""
+        """Start a separate map, and leave the present one unchanged until the robot is found in it."""
         if self.localized and not self.front_end.in_known_map:
             try:
                 before = self._before or _MapBefore(self.map, len(self.front_end.trajectory))
                 saved = SavedMap(self.config, before.map.grid(), self._graph(before.keyframes))
                 self._relocalization = Relocalization(saved, by_odometry=True)
             except ValueError:
-                self._relocalization = None  # a map without a wall or a free cell: nothing to find the robot in
+                self._relocalization = None  # the robot cannot be found in a map without walls or free cells
         if self._relocalization is not None:
-            # After a gap the robot is where odometry says, within its error; otherwise it may have been carried.
+            # After a gap in the scans, odometry holds within its error. Otherwise the robot may have been carried.
             self._relocalization.lose(self.front_end.reach_m(guess) if self.monitor.after_gap else math.inf)
         self._before = None
         self.loop_closure = LoopClosure(self.config)
@@ -403,7 +402,7 @@ class GridSlam:
         return self.front_end.restart(points, guess, stamp_ns)
 
     def _join(self, saved: SavedMap, moved: FloatArray, covariance: FloatArray, built: OccupancyMap | None) -> None:
-        """Join the current map to the saved one: ``moved`` transforms everything mapped so far into the saved map."""
+        """Join the current map to the saved one; ``moved`` (3,) transforms all current poses into the saved map."""
         self._settle()
         own = self.front_end.trajectory
         for keyframe in own:

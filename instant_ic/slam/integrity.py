@@ -1,24 +1,26 @@
-"""Integrity of the pose: distinguishes a right pose from a plausible one, and bounds the error.
+"""Integrity of the pose: probability that a plausible pose is wrong, and bounds of the error.
 
-A wrong pose may still fit the local map by its score. What gives it away is the scan's rays: they pass through walls of
-the map, or end in space that the map shows as free. Neither happens where the robot only sees something new. The
-contradiction counts together with a drop of the match score, both against the scans before: a map that has drifted
-contradicts new scans too, but gradually, and at a good score.
+A wrong pose may still have a good match score. The scan's rays reveal it: they pass through walls of the map, or end in
+space that the map shows as free. Neither happens where the robot only sees something new. The contradiction counts
+together with a drop of the match score, both relative to earlier scans. A map that has drifted contradicts new scans
+too, but gradually and at a good score.
 
 `IntegrityMonitor` is a Bayes filter on one bit, lost or not, in log-odds:
 
-1. ``contradiction``: the share of a scan's rays that contradict the map.
-2. ``matched``: the scan's log-likelihood ratio, from the rise of that share and the drop of the score; it counts in
-   proportion to the time since the scan before (``_weigh``). Time without a match raises the log-odds (``_unseen``).
-3. ``doubts``: from a first threshold on, scans stay out of the map; otherwise the scan would agree with its own copy.
-4. ``compared``: a robot that is put down in a place that looks the same fits at a good score, and each scan contradicts
-   little. After a weak ``sign``, scans are therefore provisional for some metres, and the map before them is kept. If
-   the next ones contradict it and agree with the map that has the provisional ones, metre after metre, it is lost.
-5. ``lost``: from a second threshold on, the pose is no longer used, and only recognition of the place ends this.
-6. ``integrity``: bounds of the error, by the mixture of the match's covariance and that of a lost robot.
+1. ``contradiction``: compute the share of a scan's rays that contradict the map.
+2. ``matched``: compute the scan's log-likelihood ratio from the rise of this share and the drop of the score. It counts
+   in proportion to the time since the previous scan (``_weigh``). Time without a match raises the log-odds
+   (``_unseen``).
+3. ``doubts``: above a first threshold, scans stay out of the map. Otherwise, later scans would agree with their copies.
+4. ``compared``: a robot that was put down in a place that looks alike matches well, and each scan contradicts the map
+   only a little. After a weak ``sign``, scans are therefore provisional for some metres, and the map before them is
+   kept. If further scans contradict that map but agree with the one that includes the provisional scans, the robot is
+   lost.
+5. ``lost``: above a second threshold, the pose is not used any more until the place is recognized.
+6. ``integrity``: compute bounds of the error from a mixture of the match's covariance and that of a lost robot.
 
-The ratios were chosen on the Intel log and a generated office, with robots put down elsewhere; docs/benchmarks.md has
-the figures on other logs.
+The ratios were tuned on the Intel log and a generated office, with robots put down elsewhere. docs/benchmarks.md has
+the results on other logs.
 """
 
 from __future__ import annotations
@@ -35,15 +37,15 @@ from instant_ic.slam.scan import FloatArray, ScanPoints
 POINTS = 120
 """Number of rays that are compared with the map, evenly chosen."""
 RANGE_M, SLACK_M = 12.0, 0.25
-"""Farther hits are not compared; a wall and a hit this close together agree."""
+"""Largest range of hits that are compared, and distance within which a wall and a hit agree."""
 OCCUPIED_LOG_ODDS = 1.0
-"""A cell above is a wall: two hits more than rays through it."""
+"""Log-odds above which a cell is a wall, after two more hits than rays through it."""
 LEAST_KNOWN = 20
-"""Least number of comparable rays in the share: five of five are little evidence."""
+"""Smallest denominator of the share of contradicted rays, because few comparable rays are little evidence."""
 BOUND_SIGMAS, BOUND_YAW_SIGMAS = 3.717, 3.291
-"""Standard deviations within which 99.9 % of a Gaussian lie: in the plane, and on a line."""
+"""Number of standard deviations that contain 99.9 % of a Gaussian, in the plane and on a line."""
 LOST_SIGMA_RAD = math.pi / math.sqrt(3.0)
-"""Standard deviation of a lost robot's heading: any heading."""
+"""Standard deviation of a lost robot's heading, which is uniformly distributed."""
 
 
 @dataclass(frozen=True)
@@ -51,36 +53,35 @@ class IntegrityConfig:
     """Tuning of the filter; log-odds and log-likelihood ratios are natural logarithms.
 
     Attributes:
-        recovered: least evidence of a scan that only the wide search matches: it stays out of the map.
-        full_contradiction: rise of the share of contradicted rays that is full evidence, together with
-            ``full_drop``.
-        full_drop: drop of the match score that is full evidence, together with ``full_contradiction``.
-        long_drop: drop of the score that is evidence without a contradiction; weak, since the place may be new.
-        long_drop_share: share of the full evidence that such a drop is.
-        evidence_s: scans closer in time than this see the same scene: their evidence counts in proportion to
-            the time in seconds.
-        evidence: limit of a scan's log-likelihood ratio: no single scan decides.
-        per_m: evidence of a metre in which all rays contradict the map before the sign and none the map since;
-            0.3 m at a difference of 0.3 make a sign a loss.
-        agrees: difference of the two shares up to which they agree.
-        longest_step_m: way between two scans that counts at most, in metres.
+        recovered: smallest evidence of a scan that only the wide search matches, so that it stays out of the map.
+        full_contradiction: rise of the share of contradicted rays that is full evidence together with ``full_drop``.
+        full_drop: drop of the match score that is full evidence together with ``full_contradiction``.
+        long_drop: drop of the score that is evidence without a contradiction. It is weak, as the place may be new.
+        long_drop_share: evidence of such a drop, as a share of the full evidence.
+        evidence_s: time between scans at which a scan counts in full, in seconds. Scans closer in time see the same
+            scene and count in proportion.
+        evidence: limit of a scan's log-likelihood ratio, so that no single scan decides.
+        per_m: evidence per metre in which all rays contradict the map before the sign and none contradicts the present
+            one. At a difference of 0.3, 0.3 m turn a sign into a loss.
+        agrees: difference of the two shares up to which the maps agree.
+        longest_step_m: longest way between two scans that counts, in metres.
         level_share: weight of a new scan in the usual score and contradiction.
-        floor: least log-odds of being lost; higher makes false alarms, lower delays detection.
+        floor: smallest log-odds of being lost; higher values cause false alarms, lower values delay detection.
         doubt: log-odds above which scans are kept out of the map.
-        suspicious: evidence of the last scan above which it is kept out: a quarter of a scan's, at any rate of
-            scans.
-        lost: log-odds from which the robot is lost. Scans of one place agree or disagree with the map together,
-            so later ones that fit do not restore the trust; only recognition does.
+        suspicious: evidence of the last scan above which it is kept out of the map, at any rate of scans: a quarter of
+            ``evidence``.
+        lost: log-odds at which the robot is lost. Scans of one place agree or disagree with the map together, so
+            later scans that fit do not restore the trust. Only recognition of the place does.
         unseen_s: time without a matched scan after which the log-odds grow, in seconds.
         unseen_periods: the same in usual periods of the scans; the longer time counts.
-        unseen_per_s: growth of the log-odds per second from then on.
-        unseen_most: log-odds up to which they grow.
-        new_view_m: a low score counts less as evidence after the robot has moved this far since the last
-            trusted scan, and not at all after twice the distance, in metres.
-        longest_doubt: scans after which a doubt that is less likely than not is dropped: the robot has driven
-            on, and its map must grow.
-        untrusted: probability of being lost from which a pose must not be used.
-        lost_sigma_m: standard deviation of a lost robot's position in metres: a building.
+        unseen_per_s: growth of the log-odds per second after this time.
+        unseen_most: limit of this growth, in log-odds.
+        new_view_m: distance since the last trusted scan, in metres, beyond which a low score counts less as evidence;
+            beyond twice the distance, it does not count.
+        longest_doubt: number of doubtful scans after which the doubt is dropped unless the robot is lost, because its
+            map must grow.
+        untrusted: probability of being lost at which a pose must not be used.
+        lost_sigma_m: standard deviation of a lost robot's position, in metres; the size of a building.
     """
 
     recovered: float = 1.6
@@ -115,8 +116,8 @@ TUNING = IntegrityConfig()
 def _compare_rays(cells, seen, since, origin, resolution, pose, laser, points):  # type: ignore[no-untyped-def]
     """Count the rays with a known end or wall, those that pass through a wall, and those that end in free space.
 
-    Arguments as in `contradiction`; the laser's centre ``laser`` (2,) and the hits ``points`` (n, 2) are in the base
-    frame.
+    The arguments are those of `contradiction`. The laser's centre ``laser`` (2,) and the hits ``points`` (n, 2) are in
+    the base frame.
     """
     height, width = cells.shape
     cos_yaw, sin_yaw = math.cos(pose[2]), math.sin(pose[2])
@@ -162,16 +163,16 @@ def contradiction(
     scan: ScanPoints,
     since: int = 1,
 ) -> float:
-    """Return the share of a scan's rays, 0..1, that contradict a map: through its walls, or ending in its free space.
+    """Return the share of a scan's rays, 0..1, that pass through walls of a map or end in its free space.
 
     Args:
-        cells: log-odds (H, W).
-        seen: (H, W), number of the scan that last changed a cell; 0 where the map is unknown.
-        origin: (2,) corner of cell (0, 0).
+        cells: log-odds, (H, W).
+        seen: number of the scan that last changed a cell, (H, W); 0 where the map is unknown.
+        origin: corner of cell (0, 0), (2,).
         resolution: metres per cell.
-        pose: map_from_base (3,).
-        scan: scan taken at that pose.
-        since: cells that only scans before this one have changed count as unknown.
+        pose: map_from_base, (3,).
+        scan: scan taken at this pose.
+        since: number of the oldest scan that counts; cells last changed by older scans count as unknown.
     """
     points = scan.points
     if len(points) > POINTS:
@@ -186,8 +187,8 @@ class Integrity:
 
     Attributes:
         lost_probability: probability that the robot is somewhere else, 0..1.
-        position_bound_m: protection level: the position error is below it with a probability of 99.9 %, if scan
-            matching and drift err as their covariance says.
+        position_bound_m: protection level. The position error is smaller with a probability of 99.9 %, if the
+            covariances of scan matching and drift are right.
         heading_bound_rad: the same for the heading, at most π.
     """
 
@@ -202,26 +203,26 @@ class Integrity:
 
 
 class IntegrityMonitor:
-    """Probability of being lost, from scan to scan.
+    """Estimator of the probability of being lost, updated by each scan.
 
     Attributes:
         contradiction: share of the last scan's rays that contradict the map, 0..1.
-        after_gap: whether the doubt began with a time without matched scans.
-        sign: whether the last scan is evidence, however weak, of another place.
+        after_gap: true if the doubt began with a time without matched scans.
+        sign: true if the last scan is evidence, even if weak, of another place.
     """
 
     def __init__(self) -> None:
         self.contradiction = 0.0
         self.after_gap = self.sign = False
         self._log_odds = self._provisional_log_odds = TUNING.floor
-        self._suspicious = False  # by the last scan alone, whatever the time since the one before
+        self._suspicious = False  # by the last scan alone, independent of the time since the previous one
         self._unseen_s = 0.0
         self._moved_m = 0.0
         self._period_s: float | None = None
         self._doubtful_scans = 0
         self._score_level: float | None = None
-        # The level, or the value of the scan before if that is worse: a gradual change, as in a turn or in a map that
-        # has drifted, is no sign of another place.
+        # The level, or the previous scan's value if that is worse. A gradual change, as in a turn or in a map that has
+        # drifted, is thus no sign of another place.
         self._usual_score = self._usual_contradiction = 0.0
         self._contradiction_level = 0.0
 
@@ -232,7 +233,7 @@ class IntegrityMonitor:
 
     @property
     def lost(self) -> bool:
-        """True if the pose must no longer be used, and the map be left as it is."""
+        """True if the pose must not be used any more and the map must stay unchanged."""
         return max(self._log_odds, self._provisional_log_odds) >= TUNING.lost
 
     @property
@@ -243,14 +244,14 @@ class IntegrityMonitor:
     def matched(
         self, contradicted: float, score: float, elapsed_s: float, recovered: bool = False, moved_m: float = 0.0
     ) -> None:
-        """Weigh a scan that fits somewhere.
+        """Update the probability by a scan with a match.
 
         Args:
-            contradicted: share of its rays that contradict the map as it was before, 0..1; see `contradiction`.
+            contradicted: share of the scan's rays that contradict the map before it, 0..1; see `contradiction`.
             score: score of the match, 0..1.
-            elapsed_s: seconds since the scan before.
-            recovered: only the wide search has matched it.
-            moved_m: metres driven since the scan before; a radian counts as half a metre.
+            elapsed_s: seconds since the previous scan.
+            recovered: true if only the wide search has matched the scan.
+            moved_m: metres driven since the previous scan; a radian counts as half a metre.
         """
         self.contradiction = contradicted
         usual = score if self._score_level is None else self._usual_score
@@ -277,38 +278,38 @@ class IntegrityMonitor:
             self._usual_contradiction = max(self._contradiction_level, contradicted)
 
     def compared(self, excess: float, moved_m: float) -> None:
-        """Weigh a scan that was compared with the map before a sign and with the map since.
+        """Update the probability by a scan that was compared with the map before a sign and with the present one.
 
-        Scans of one place agree or disagree together, so evidence counts by the way driven.
+        Scans of one place agree or disagree together, so evidence counts per distance driven.
 
         Args:
-            excess: share of its rays that contradict the map before, less the share that contradicts the map since.
-            moved_m: metres driven since the scan before; a radian counts as half a metre.
+            excess: share of the rays that contradict the map before the sign, less the share for the present map.
+            moved_m: metres driven since the previous scan; a radian counts as half a metre.
         """
         evidence = TUNING.per_m * (excess - TUNING.agrees) * min(moved_m, TUNING.longest_step_m)
         self._provisional_log_odds = _bounded(self._provisional_log_odds + evidence)
 
     def settled(self) -> None:
-        """Forget the comparison: the provisional scans have become part of the map."""
+        """Forget the comparison, because the provisional scans have become part of the map."""
         self._provisional_log_odds = TUNING.floor
 
     def unmatched(self, fits_nowhere: bool, elapsed_s: float) -> None:
-        """Weigh a scan without a match: it fits nowhere near, or has no points."""
+        """Update the probability by a scan without a match, which fits nowhere near or has too few points."""
         self._note_gap(elapsed_s)
         if fits_nowhere:
             self._weigh(TUNING.evidence, elapsed_s)
         self._unseen(elapsed_s)
 
     def _note_gap(self, elapsed_s: float) -> None:
-        """Note whether a doubt begins with a time without matched scans; call before the scan raises a doubt itself."""
+        """Record whether a doubt begins with a gap in the matched scans. Call this before the scan raises a doubt."""
         self.after_gap = self.after_gap or (not self.doubts and self._unseen_s + elapsed_s > self._usual_s(elapsed_s))
 
     def _usual_s(self, elapsed_s: float) -> float:
-        """Return the time between matched scans that raises no doubt."""
+        """Return the longest time between matched scans that raises no doubt."""
         return max(TUNING.unseen_s, TUNING.unseen_periods * (elapsed_s if self._period_s is None else self._period_s))
 
     def _unseen(self, elapsed_s: float) -> None:
-        """Let the doubt grow with the time without a matched scan."""
+        """Raise the log-odds for the time without a matched scan."""
         usual_s = self._usual_s(elapsed_s)
         before = max(self._unseen_s - usual_s, 0.0)
         self._unseen_s += elapsed_s
@@ -319,7 +320,7 @@ class IntegrityMonitor:
         self._period_s = period_s + TUNING.level_share * (min(elapsed_s, usual_s) - period_s)
 
     def integrity(self, covariance: FloatArray, localized: bool) -> Integrity:
-        """Return the trust in a pose of ``covariance`` (3, 3); a robot without a place in its saved map is lost."""
+        """Return the trust in a pose with ``covariance`` (3, 3). A robot that is not localized counts as lost."""
         lost = self.lost_probability if localized else 1.0
         mixed = mixture(covariance, lost)
         sigma_m = math.sqrt(max(float(np.linalg.eigvalsh(mixed[:2, :2])[-1]), 0.0))
@@ -340,7 +341,7 @@ def _bounded(log_odds: float) -> float:
 
 
 def mixture(covariance: FloatArray, lost_probability: float) -> FloatArray:
-    """Return the covariance (3, 3) of a pose that is wrong with a probability; its own below the monitor's floor."""
+    """Return the covariance (3, 3) of a pose that may be wrong; unchanged up to the monitor's lowest probability."""
     floor = 1.0 / (1.0 + math.exp(-TUNING.floor))
     p = min(max((lost_probability - floor) / (1.0 - floor), 0.0), 1.0)
     lost = np.diag(np.square([TUNING.lost_sigma_m, TUNING.lost_sigma_m, LOST_SIGMA_RAD]))

@@ -1,9 +1,9 @@
-"""Likelihood field: how well a point fits the surfaces seen in recent keyframes.
+"""Likelihood field: agreement of a point with the surfaces seen in recent keyframes.
 
 The value at a point is ``exp(−d²/2σ²)``, with ``d`` the distance to the nearest seen surface (Thrun, Burgard, Fox,
-Probabilistic Robotics, 6.4), on a square grid around the robot. The surface in a cell is the mean of all hits in and
-near the cell. A field built from single hits would turn range noise into a flat ridge along each wall, on which scans
-drift.
+Probabilistic Robotics, 6.4). It is stored on a square grid around the robot. The surface in a cell is the mean of all
+hits in and near the cell. A field of single hits would have a flat ridge along each wall, as wide as the range noise,
+on which scans drift.
 """
 
 from __future__ import annotations
@@ -19,16 +19,16 @@ from numpy.typing import NDArray
 from instant_ic.slam.scan import FloatArray
 
 SIGMA_M = 0.06
-"""σ of the field about a surface: a larger value tolerates larger errors but is less precise."""
+"""σ of the field around a surface. A larger value tolerates larger errors but is less precise."""
 SURFACE_SIGMA_M = 0.04
-"""Hits within this distance are averaged to one surface; about the range noise of a laser."""
+"""Distance within which hits are averaged to one surface, about the range noise of a laser."""
 GAP_WEIGHT = 0.1
 """Weight of an interpolated point between two joined hits, relative to a hit."""
 
 
 @njit(cache=True)
 def _add(weight, sum_x, sum_y, touched, count, x, y, w, margin):  # type: ignore[no-untyped-def]
-    """Add a surface point to its cell; return the number of touched cells."""
+    """Add a surface point to its cell. Return the new number of touched cells."""
     height, width = weight.shape
     ix, iy = math.floor(x + 0.5), math.floor(y + 0.5)
     if ix < margin or iy < margin or ix >= width - margin or iy >= height - margin:
@@ -52,20 +52,20 @@ def accumulate(  # type: ignore[no-untyped-def]
     """Add the hits of one keyframe, and the surface between joined hits, to the cell sums.
 
     Args:
-        weight: float64 (H, W), changed in place, as sum_x and sum_y.
-        sum_x: weighted sums of the hits' x in cells, (H, W).
-        sum_y: weighted sums of the hits' y in cells, (H, W).
-        touched: int32 (n, 2), row and column of the cells with weight; the first ``count`` are in use.
+        weight: weights of the hits, (H, W) float64; changed in place.
+        sum_x: weighted sums of the hits' x, in cells, (H, W); changed in place.
+        sum_y: weighted sums of the hits' y, in cells, (H, W); changed in place.
+        touched: row and column of the cells with weight, (n, 2) int32; changed in place.
         count: number of rows of ``touched`` in use.
-        origin: (2,) centre of cell (0, 0), metres.
+        origin: centre of cell (0, 0) in metres, (2,).
         resolution: metres per cell.
-        pose: field_from_base (3,).
-        points: (n, 2) in the base frame.
-        joined: (n,) whether point ``i`` continues point ``i - 1``.
-        margin: width of the border, in cells, where no points are added.
+        pose: field_from_base, (3,).
+        points: hits in the base frame, (n, 2).
+        joined: whether point ``i`` continues the surface of point ``i - 1``, (n,).
+        margin: width of the border, in cells, in which no points are added.
 
     Returns:
-        The new count.
+        The new ``count``.
     """
     cos_yaw, sin_yaw = math.cos(pose[2]), math.sin(pose[2])
     last_x = 0.0
@@ -74,8 +74,7 @@ def accumulate(  # type: ignore[no-untyped-def]
         x = (pose[0] + cos_yaw * points[i, 0] - sin_yaw * points[i, 1] - origin[0]) / resolution
         y = (pose[1] + sin_yaw * points[i, 0] + cos_yaw * points[i, 1] - origin[1]) / resolution
         if i > 0 and joined[i]:
-            # Beams leave gaps on far walls. A dotted wall would lock the scan to the pose that the field was built
-            # from.
+            # Beams leave gaps on far walls. A dotted wall would lock scans to the poses from which the field was built.
             steps = int(math.hypot(x - last_x, y - last_y))
             for k in range(1, steps + 1):
                 part = k / (steps + 1.0)
@@ -94,10 +93,10 @@ def fill_cells(field, weight, sum_x, sum_y, touched, count, sigma, pull):  # typ
     """Fill the field with a Gaussian around the surface in each touched cell.
 
     Args:
-        field: float32 (H, W), changed in place.
+        field: values of the field, (H, W) float32; changed in place.
         weight: weights of the hits, (H, W).
-        sum_x: weighted sums of their x, (H, W).
-        sum_y: weighted sums of their y, (H, W).
+        sum_x: weighted sums of the hits' x, in cells, (H, W).
+        sum_y: weighted sums of the hits' y, in cells, (H, W).
         touched: row and column of the cells with weight, (n, 2).
         count: number of rows of ``touched`` in use.
         sigma: standard deviation of the field, in cells.
@@ -110,7 +109,7 @@ def fill_cells(field, weight, sum_x, sum_y, touched, count, sigma, pull):  # typ
     for t in range(count):
         iy, ix = touched[t, 0], touched[t, 1]
         cx, cy = sum_x[iy, ix] / weight[iy, ix], sum_y[iy, ix] / weight[iy, ix]
-        # One mean-shift step: the hits of a wall along a cell border fall into two rows of cells.
+        # Do one mean-shift step, because the hits of a wall along a cell border fall into two rows of cells.
         total = 0.0
         x = 0.0
         y = 0.0
@@ -158,8 +157,8 @@ class LikelihoodField:
     """A square likelihood field around the robot.
 
     Attributes:
-        values: float32 (n, n).
-        origin: (2,) metres, centre of cell (0, 0).
+        values: values of the field, (n, n) float32.
+        origin: centre of cell (0, 0) in metres, (2,).
         resolution: metres per cell.
 
     Args:
@@ -179,7 +178,7 @@ class LikelihoodField:
         self._touched = np.zeros((200_000, 2), dtype=np.int32)
 
     def rebuild(self, centre: FloatArray, surfaces: Sequence[FieldSurface]) -> None:
-        """Rebuild the field from ``surfaces``, shifted by whole cells so that ``centre`` (2,) is in the middle."""
+        """Rebuild the field from ``surfaces``, with its middle within a cell of ``centre`` (2,)."""
         half = self.values.shape[0] // 2
         self.origin = (np.round(np.asarray(centre[:2]) / self.resolution) - half) * self.resolution
         self.values.fill(0.0)

@@ -1,4 +1,4 @@
-"""Localisation in a saved map, without an initial pose; the map may then be extended."""
+"""Localisation in a saved map without an initial pose."""
 
 from __future__ import annotations
 
@@ -22,18 +22,18 @@ from instant_ic.slam.pose_graph import Edge
 from instant_ic.slam.scan import FloatArray, ScanPoints
 
 POINTS = 120
-"""Number of query points in the search; the refinement uses all."""
+"""Number of query points in the search. The refinement uses all points."""
 LEVELS = 4
-"""Pooled fields, each with cells twice as wide as the one before; the first has cells of `POOL` field cells."""
+"""Number of pooled fields. The first has cells of `POOL` field cells, each further one cells twice as wide."""
 FIRST_FLOOR, FLOOR_STEP = 0.9, 0.1
-"""Score above which all poses are examined first, and its step down: a good place makes those below needless."""
+"""Score above which poses are examined first, and its decrement. A good place makes lower scores needless."""
 MIN_GAIN = 0.2
-"""Share of the residual of every other place that the found place must explain."""
+"""Share of every other place's residual that the found place must explain."""
 MAX_STARTS, MAX_NODES = 150, 1_200_000
-"""Maximum numbers of refined poses and of bounds of a search. A search that needs more has not shown that its place is
-the only one, so that place is ambiguous."""
+"""Maximum numbers of refined poses and of bounds in a search. A search that needs more cannot show that its place is
+the only one, so the place counts as ambiguous."""
 SEARCH_PERIOD_S = 0.5
-"""Least time between the scans of two searches: a lost robot must not spend its time on searching."""
+"""Smallest time between the scans of two searches, which limits the load of a lost robot."""
 SAME_M, SAME_RAD = 0.3, 0.1
 """Largest difference between the places of two scans that confirm each other."""
 UNKNOWN_STEP = np.diag([100.0, 100.0, 10.0])
@@ -42,21 +42,21 @@ UNKNOWN_STEP = np.diag([100.0, 100.0, 10.0])
 
 @njit(cache=True)
 def bound_nodes(field, origin, resolution, points, nodes, sums, counts, floor, rotation_step):  # type: ignore[no-untyped-def]
-    """Bound the score of the points over nodes, each a cell of translations at one heading.
+    """Compute upper bounds of the points' score over nodes, each a cell of translations at one heading.
 
-    A node's sum goes on only while its bound, ``(sums + n - counts) / n``, is ``floor`` or more, and is continued by a
-    call with a lower floor.
+    A node's sum stops once its bound ``(sums + n - counts) / n`` falls below ``floor``. A later call with a lower floor
+    continues it.
 
     Args:
-        field: float32 (H, W), pooled: a cell holds the best value within it and its next neighbours.
-        origin: (2,) centre of the first cell of the field that was pooled.
+        field: pooled field, (H, W) float32; a cell holds the best value within it and its next neighbours.
+        origin: centre of the first cell of the field that was pooled, (2,).
         resolution: metres per pooled cell.
-        points: (n, 2) in the base frame, n > 0.
-        nodes: int32 (k, 3): rotation, row, column; a node is the translations of a pooled cell.
-        sums: float32 (k,), of the field over the first ``counts`` points; changed in place.
-        counts: int32 (k,), changed in place.
+        points: points in the base frame, (n, 2), n > 0.
+        nodes: rotation, row and column of each node, (k, 3) int32; a node covers the translations of a pooled cell.
+        sums: sum of the field over the first ``counts`` points, (k,) float32; changed in place.
+        counts: number of points in each sum, (k,) int32; changed in place.
         floor: lowest bound of interest, 0..1.
-        rotation_step: radians.
+        rotation_step: heading step in radians.
     """
     height, width = field.shape
     n = points.shape[0]
@@ -69,7 +69,7 @@ def bound_nodes(field, origin, resolution, points, nodes, sums, counts, floor, r
         if nodes[k, 0] != rotation:
             rotation = nodes[k, 0]
             cos_yaw, sin_yaw = math.cos(rotation * rotation_step), math.sin(rotation * rotation_step)
-            # A pooled cell holds the values around its lower corner; those above it are in the next one.
+            # A pooled cell holds the values around its lower corner. Values beyond it are in the next cell.
             for i in range(n):
                 columns[i] = math.floor((cos_yaw * points[i, 0] - sin_yaw * points[i, 1]) / resolution) + 1
                 rows[i] = math.floor((sin_yaw * points[i, 0] + cos_yaw * points[i, 1]) / resolution) + 1
@@ -86,7 +86,7 @@ def bound_nodes(field, origin, resolution, points, nodes, sums, counts, floor, r
 
 @dataclass
 class _SearchLevel:
-    """Nodes of one level of a search that have not been divided: (k, 3), with their sums and counts (k,)."""
+    """Undivided nodes (k, 3) of one level of a search, with their sums and counts (k,)."""
 
     nodes: NDArray[np.int32]
     sums: NDArray[np.float32]
@@ -112,12 +112,12 @@ class _SearchLevel:
 class Localizer:
     """Finds scans in a saved map, by branch and bound over all positions and headings.
 
-    A pooled field bounds the score of every pose of a cell of translations (Hess et al., Real-time loop closure in 2D
-    LIDAR SLAM, ICRA 2016). All cells that may hold a pose above a score are visited, so a place that is reported as
-    the only one is so by search, not by a limit on the number of candidates.
+    A pooled field bounds the score of all poses in a cell of translations (Hess et al., Real-time loop closure in 2D
+    LIDAR SLAM, ICRA 2016). All cells that may hold a pose above a score are visited. A place is therefore reported as
+    the only one because the search was complete, not because the number of candidates is limited.
 
     Attributes:
-        points: the map's occupied cells (n, 2).
+        points: centres of the map's occupied cells, (n, 2).
 
     Raises:
         ValueError: the map has no occupied or no free cell.
@@ -147,13 +147,13 @@ class Localizer:
     def find(
         self, points: FloatArray, centre: FloatArray | None = None, reach_m: float = math.inf
     ) -> tuple[Found | None, bool]:
-        """Return the only pose where the points (n, 2), in the base frame, fit, and whether several places fit.
+        """Return the only pose at which the points (n, 2) in the base frame fit, and whether several places fit.
 
-        Only positions within ``reach_m`` of ``centre`` (2,) are searched, if there is one.
+        If ``centre`` (2,) is given, only positions within ``reach_m`` of it are searched.
         """
         if len(points) < 10:
             return None, False
-        # In an order without a pattern the sums of the bounds reach their end, or their floor, soonest.
+        # In random order, the sums of the bounds fall below the floor soonest.
         few = points[np.random.default_rng(0).permutation(len(points))[:POINTS]]
         nodes = np.argwhere(self._free[-1])
         if centre is not None:
@@ -169,11 +169,11 @@ class Localizer:
             starts = self._starts(levels[0], len(few), floor) if left >= 0 else None
             if starts is None or len(starts) > MAX_STARTS:
                 return None, True
-            # A lower floor adds starts after those of a higher one.
+            # With a lower floor, new starts follow those of the higher floor.
             found += self._refined(points, starts[examined:])
             found.sort(key=lambda one: -one.score)
             examined = len(starts)
-            # Every pose with a score of the floor or more is examined. Those below may matter while the best is poor.
+            # Every pose that scores at least the floor has been examined. Lower ones may matter if the best is poor.
             rival = self._rival(found[0].score) if found else 0.0
             if rival >= floor or floor <= MIN_PLACE_SCORE:
                 break
@@ -188,19 +188,20 @@ class Localizer:
 
     @staticmethod
     def _rival(score: float) -> float:
-        """Return the score of another place from which on a place with ``score`` is ambiguous."""
+        """Return the score that another place must have to make a place with ``score`` ambiguous."""
         return (score - MIN_GAIN) / (1.0 - MIN_GAIN)
 
     def _levels(self, nodes: NDArray[np.intp]) -> list[_SearchLevel]:
-        """Return the levels of a search in ``nodes`` (n, 2) of the last one, at all headings."""
+        """Return the levels of a search that starts with ``nodes`` (n, 2) of the last level at all headings."""
         rotations = np.repeat(np.arange(self._rotations), len(nodes))
         first = np.column_stack([rotations, np.tile(nodes, (self._rotations, 1))]).astype(np.int32)
         return [*(_SearchLevel.of(np.zeros((0, 3), dtype=np.int32)) for _ in range(LEVELS - 1)), _SearchLevel.of(first)]
 
     def _bound(self, levels: list[_SearchLevel], points: FloatArray, floor: float, left: int) -> int:
-        """Divide the nodes whose bound is ``floor`` or more, down to the first level.
+        """Divide the nodes whose bound is at least ``floor``, down to the first level.
 
-        Returns what remains of ``left`` bounds; a negative value: they were too few, and the search has stopped.
+        ``left`` is the number of bounds that may still be computed. Return the rest of it; the search has stopped early
+        if this is negative.
         """
         for k in range(LEVELS - 1, -1, -1):
             level, resolution = levels[k], self._field.resolution * (POOL << k)
@@ -224,7 +225,7 @@ class Localizer:
         return left
 
     def _starts(self, level: _SearchLevel, count: int, floor: float) -> FloatArray:
-        """Return the poses (k, 3), best bound first, around which every score of ``floor`` or more lies."""
+        """Return the poses (k, 3), best bound first, around which all scores of at least ``floor`` lie."""
         good = (level.counts == count) & (level.sums >= floor * count)
         order = np.flatnonzero(good)[np.argsort(-level.sums[good], kind="stable")]
         nodes = level.nodes[order]
@@ -241,7 +242,7 @@ class Localizer:
 
 @njit(cache=True)
 def keep_peaks(nodes, rotations, count):  # type: ignore[no-untyped-def]
-    """Return the indices of at most ``count`` nodes (k, 3), none next to one before it in translation and rotation."""
+    """Return the indices of at most ``count`` nodes (k, 3), leaving out neighbours of earlier ones."""
     kept = np.zeros(count, dtype=np.int64)
     taken = 0
     for k in range(nodes.shape[0]):
@@ -266,9 +267,9 @@ class FoundPlace:
     """Result of a search in the saved map.
 
     Attributes:
-        pose: pose of the scan that was searched for, in the frame of its own map (3,).
-        found: its pose in the saved map; None if not found or not confirmed by a second scan yet.
-        map: built from the saved keyframes if the map is to be extended; otherwise None.
+        pose: pose of the scan in its own map, (3,).
+        found: pose of the scan in the saved map; None if it was not found or not yet confirmed by a second scan.
+        map: map built from the saved keyframes; None unless the map is to be extended.
     """
 
     pose: FloatArray
@@ -277,19 +278,20 @@ class FoundPlace:
 
 
 class SavedMap:
-    """A map from disk, in which the robot is located first.
+    """A map in which the robot is to be located, from disk or from an earlier session.
 
     Args:
+        config: parameters.
         grid: the map.
-        graph: its keyframes and edges, to extend the map; None: the map stays unchanged.
+        graph: keyframes and edges of the map, with which it is extended; None keeps the map unchanged.
 
     Attributes:
-        grid: the map as read.
-        localizer: finds scans in it.
+        grid: the map as given.
+        localizer: finds scans in the map.
         keyframes: saved keyframes; empty if the map stays unchanged.
-        edges: edges between them.
-        located: whether the robot is located in the map.
-        ambiguous: whether the last search found several places that fit.
+        edges: edges between the saved keyframes.
+        located: true if the robot is located in the map.
+        ambiguous: true if the last search found several places that fit.
     """
 
     def __init__(
@@ -312,7 +314,7 @@ class SavedMap:
 
     @property
     def unchanged(self) -> bool:
-        """True if the map is still as it was read."""
+        """True if the map has not been changed."""
         return not (self.extends and self.located)
 
     def search_job(
@@ -325,9 +327,9 @@ class SavedMap:
     ) -> Callable[[], FoundPlace] | None:
         """Return a job that searches the map for the recent keyframes and the newest scan, whose pose is ``pose`` (3,).
 
-        A finite ``reach_m`` limits the search to the surroundings of ``pose``.
-        None if the newest keyframe was searched for already and no place waits for its confirmation, or if the search
-        before was less than `SEARCH_PERIOD_S` ago.
+        A finite ``reach_m`` limits the search to the surroundings of ``pose``. Return None if the newest keyframe was
+        searched for already and no place waits for confirmation, or if the previous search was less than
+        `SEARCH_PERIOD_S` ago.
         """
         if not recent or (recent[-1] is self._searched and self._unconfirmed is None):
             return None
@@ -346,9 +348,9 @@ class SavedMap:
         return search
 
     def _confirmed(self, found: Found | None, pose: FloatArray) -> bool:
-        """Return whether the place agrees with that of the scan before; it then waits no longer."""
+        """Return whether the place agrees with the unconfirmed place of the previous search, and update the latter."""
         before = self._unconfirmed
-        # The saved map's pose of the other map's origin is the same for every scan.
+        # Store the pose of the other map's origin in the saved map, which is the same for every scan.
         self._unconfirmed = None if found is None else compose2(found.pose, relative2(pose, np.zeros(3)))
         if found is None or before is None:
             return False
@@ -366,9 +368,9 @@ class SavedMap:
         return built
 
     def join(self, own: Sequence[ScanKeyframe], covariance: FloatArray) -> LoopClosure:
-        """Tie keyframes ``own``, located with ``covariance`` (3, 3), to the saved graph; return its loop closure."""
+        """Tie keyframes ``own``, located with ``covariance`` (3, 3), to the saved graph. Return its loop closure."""
         first = own[0]
-        # The motion from the last saved keyframe is unknown; the first new keyframe is tied by its pose in the map.
+        # The motion from the last saved keyframe is unknown, so the first new keyframe is tied by its pose in the map.
         first.step = relative2(self.keyframes[-1].map_from_base, first.map_from_base)
         first.step_covariance = UNKNOWN_STEP
         for keyframe in own:

@@ -1,16 +1,16 @@
-"""Loop closure: finds loops over the keyframes and optimises their poses, in parallel to the scan thread.
+"""Loop closure: search for loops between keyframes and optimisation of their poses, in parallel to the scan thread.
 
-It keeps its own copy of the poses. Only new keyframes go in, and only a `LoopOutcome` comes out. The result does not
-depend on timing: the same keyframes give the same result. `LoopClosure.update`, for each new keyframe:
+Loop closure keeps its own copy of the poses. Only new keyframes go in, and only a `LoopOutcome` comes out. The same
+keyframes therefore give the same result, independent of timing. `LoopClosure.update`, for each new keyframe:
 
-1. ``_add``: tie it to the keyframe before by the measured step, and grow the drift.
+1. ``_add``: tie the keyframe to the previous one by the measured step, and grow the drift.
 2. ``_chains``: every `SPACING_M`, find runs of older keyframes within the drift of its pose.
-3. ``find_place``: match the recent keyframes (``_query``) against each run, by correlative search. The place must have
-   a shape and be clearly better than the next one (``_good``).
+3. ``find_place``: match the recent keyframes (``_query``) against each run, by correlative search. The place must fix
+   the pose in every direction and be clearly better than the next best place (``_good``).
 4. ``_confirm``: a large correction needs several loops that agree with each other.
-5. ``_optimise``: optimise the pose graph (``pose_graph``); a loop that the rest contradicts is rejected.
-6. ``_thin_out``: in a place with enough keyframes, remove the new one and chain its edges.
-7. ``_rebuild_map``: if poses have changed, build the occupancy map again.
+5. ``_optimise``: optimise the pose graph (``pose_graph``), and reject loops that the rest of the graph contradicts.
+6. ``_thin_out``: remove a keyframe in a place with enough older ones, and chain its edges.
+7. ``_rebuild_map``: rebuild the occupancy map if poses have changed.
 """
 
 from __future__ import annotations
@@ -32,36 +32,35 @@ from instant_ic.slam.pose_graph import Edge, optimise, residuals
 from instant_ic.slam.scan import FloatArray, ScanPoints
 
 SPACING_M = 0.5
-"""Distance between two searches for a loop."""
+"""Distance driven between two searches for a loop."""
 QUERY_KEYFRAMES = 10
-"""Number of recent keyframes that are matched together against older ones: some metres of track have a shape."""
+"""Number of recent keyframes matched together against older ones, because some metres of track have a unique shape."""
 QUERY_RANGE_M, QUERY_POINTS = 20.0, 250
-"""Farther hits are ignored; maximum number of points of the recent keyframes."""
+"""Largest range of hits that are used, and maximum number of points of the recent keyframes."""
 CHAIN_KEYFRAMES, MIN_CHAIN_KEYFRAMES = 20, 5
-"""Number of consecutive older keyframes that the recent ones are matched against; fewer than the minimum are not
-reliable."""
+"""Number of consecutive older keyframes against which the recent ones are matched, and smallest reliable number."""
 CHAINS = 2
-"""Number of places searched at a time; the drift at the others is larger."""
+"""Number of places searched at a time, lowest drift first."""
 SIGMAS, MAX_REACH_M, MAX_REACH_RAD = 3.0, 10.0, 0.8
-"""Search range in standard deviations of the drift, and its limits in translation and heading."""
+"""Search range in standard deviations of the drift, and its limits."""
 MIN_SHAPE = 0.05
-"""Minimum ratio of least to most information by direction; about 0 in a bare corridor."""
+"""Minimum ratio of smallest to largest information over all directions; about 0 in a bare corridor."""
 MIN_GAIN = 0.35
 """Share of the second best place's residual that the best place must explain."""
 CONFIRMATIONS = 3
-"""Number of keyframes whose loops must agree before a correction beyond the next limits."""
+"""Number of keyframes whose loops must agree before a correction beyond `SURE_M` or `SURE_RAD`."""
 SURE_M, SURE_RAD = 0.25, 0.06
-"""A correction below both needs no confirmation: a keyframe spacing and three coarse heading steps."""
+"""Largest correction that needs no confirmation: a keyframe spacing, and three coarse heading steps."""
 LOOP_SIGMA_M, LOOP_SIGMA_RAD = 0.03, 0.01
-"""Error of a loop closure beyond its own covariance."""
+"""Standard deviation of a loop closure beyond its own covariance."""
 SAME_PLACE, SAME_PLACE_M, SAME_PLACE_RAD = 3, 0.35, 0.35
-"""A new keyframe is removed if this many older ones lie within this distance and heading difference."""
+"""Number of older keyframes within a distance and heading difference that make a new keyframe superfluous."""
 OVERLAP_M = 3.0
-"""Distance, beyond the pose uncertainty, within which an older keyframe is compared."""
+"""Distance beyond the pose's uncertainty within which older keyframes are compared."""
 SETTLED_M, SETTLED_RAD = 0.02, 0.004
-"""Loops that already fit the graph this closely do not trigger an optimisation ..."""
+"""Largest error at which a loop already fits the graph and needs no optimisation at once."""
 SETTLED_EDGES = 20
-"""... until this many of them are waiting."""
+"""Number of such loops at which the graph is optimised nevertheless."""
 MAX_LOOPS_OF_ONE = 4
 """Maximum number of loops that a keyframe keeps when it inherits those of a removed one."""
 PENDING_KEYFRAMES = 40
@@ -74,11 +73,11 @@ class LoopOutcome:
 
     Attributes:
         count: number of keyframes processed.
-        poses: poses of these keyframes (count, 3); None if unchanged.
+        poses: poses of these keyframes, (count, 3); None if unchanged.
         alive: indices of the keyframes that have not been removed, ascending.
-        drift: covariance of the last keyframe in the map (3, 3).
-        map: rebuilt from all keyframes; None if it was not rebuilt.
-        merged: removed keyframes, each with the one that replaces it and its pose there (3,).
+        drift: covariance of the last keyframe in the map, (3, 3).
+        map: map rebuilt from all keyframes; None if it was not rebuilt.
+        merged: removed keyframes, each with the one that replaces it and its pose relative to that one, (3,).
         edges: current edges of the graph.
     """
 
@@ -91,10 +90,10 @@ class LoopOutcome:
     edges: list[Edge]
 
     def apply(self, keyframes: Sequence[ScanKeyframe]) -> FloatArray | None:
-        """Move, merge and update the trajectory's keyframes, also those added since the update began.
+        """Move, merge and update the trajectory's keyframes, including those added since the update began.
 
         Returns:
-            The transform (3,) that the newest part of the map has moved by; None if nothing moved.
+            The transform (3,) by which the newest part of the map has moved; None if nothing moved.
         """
         moved = None
         newer = keyframes[self.count :]
@@ -117,7 +116,7 @@ class LoopOutcome:
 
 @dataclass(frozen=True)
 class _Candidate:
-    """A loop that passed all individual checks and waits for others that agree with it."""
+    """A loop that has passed all individual checks and waits for other loops that agree."""
 
     edge: Edge
     travelled_m: float
@@ -127,9 +126,9 @@ class LoopClosure:
     """Loop closure and pose graph.
 
     Attributes:
-        edges: edges of the graph; node ids are positions in the list of keyframes.
+        edges: edges of the graph; node ids are indices in the list of keyframes.
         closed: number of accepted loops.
-        refused: number of loops rejected after optimisation, because the rest of the graph contradicted them.
+        refused: number of loops that were rejected after optimisation, because the rest of the graph contradicts them.
     """
 
     def __init__(self, config: SlamConfig) -> None:
@@ -158,11 +157,11 @@ class LoopClosure:
         return self._poses[: len(self._keyframes)]
 
     def update(self, new: Sequence[ScanKeyframe], last: bool = False) -> LoopOutcome:
-        """Add new keyframes, search for loops, and optimise when it improves the graph.
+        """Add new keyframes, search for loops, and optimise if that improves the graph.
 
         Args:
             new: keyframes since the last call, in order.
-            last: no more keyframes will follow: complete all pending work.
+            last: complete all pending work, because no more keyframes will follow.
         """
         changed = False
         for keyframe in new:
@@ -182,7 +181,7 @@ class LoopClosure:
         return LoopOutcome(len(self), poses, alive, drift, rebuilt, merged, list(self.edges))
 
     def load(self, keyframes: Sequence[ScanKeyframe], edges: Sequence[Edge]) -> None:
-        """Start with a saved graph; its first keyframe stays fixed."""
+        """Start with a saved graph, whose first keyframe stays fixed."""
         for keyframe in keyframes:
             self._add(keyframe)
         self.edges = list(edges)
@@ -191,7 +190,7 @@ class LoopClosure:
         self._built = self.poses.copy()
 
     def tie(self, here: int, pose: FloatArray, covariance: FloatArray) -> None:
-        """Tie keyframe ``here``, added next, to the existing keyframes, at ``pose`` (3,) in their map."""
+        """Tie keyframe ``here``, which is added next, to the existing keyframes at ``pose`` (3,) in their map."""
         near = int(np.argmin(((self.poses[:, :2] - pose[:2]) ** 2).sum(axis=1)))
         yaw = float(self._poses[near, 2])
         self.edges.append(Edge(near, here, relative2(self._poses[near], pose), _loop_covariance(covariance, yaw)))
@@ -215,7 +214,7 @@ class LoopClosure:
             self._drifts.append(
                 grown_drift(self._drifts[-1], pose[:2] - before[:2], float(before[2]), keyframe.step_covariance)
             )
-            # Turning also reveals new surfaces: a radian counts as half a metre.
+            # Turning reveals new surfaces too, so a radian counts as half a metre.
             way = math.hypot(keyframe.step[0], keyframe.step[1]) + 0.5 * abs(float(keyframe.step[2]))
             self._travelled.append(self._travelled[-1] + way)
             self.edges.append(Edge(here - 1, here, keyframe.step, keyframe.step_covariance))
@@ -224,7 +223,7 @@ class LoopClosure:
     # -- loops ------------------------------------------------------------------------------------
 
     def _close(self, here: int) -> bool:
-        """Search for loops that end at keyframe ``here``; return True if poses changed."""
+        """Search for loops that end at keyframe ``here``. Return True if poses have changed."""
         first = max(0, here - QUERY_KEYFRAMES + 1)
         old = first - LOCAL_KEYFRAMES
         if old < MIN_CHAIN_KEYFRAMES:
@@ -281,13 +280,13 @@ class LoopClosure:
         return sorted(chains, key=lambda chain: float(np.trace(self._drifts[chain[0]][:2, :2])))
 
     def _query(self, first: int, here: int) -> FloatArray:
-        """Return the points of the last keyframes in the frame of the newest, (n, 2)."""
+        """Return the points of the recent keyframes in the frame of the newest, (n, 2)."""
         members = range(first, here + 1)
         return gather([self._poses[k] for k in members], [self._keyframes[k].scan for k in members])
 
     def _good(self, found: Found) -> bool:
-        # In a corridor, two walls give a medium score anywhere along it. The criterion is therefore the share of the
-        # remainder, unexplained by the second best pose, that the best pose explains.
+        # In a corridor, the two walls give a medium score anywhere along it. The criterion is therefore how much of the
+        # residual of the second best pose the best pose explains.
         gain = (found.score - found.runner_up) / max(1.0 - found.runner_up, 1e-6)
         return found.score >= MIN_PLACE_SCORE and found.shape >= MIN_SHAPE and gain >= MIN_GAIN
 
@@ -296,9 +295,9 @@ class LoopClosure:
         return Edge(there, here, relative2(self._poses[there], found.pose), covariance, robust=True)
 
     def _confirm(self, candidate: _Candidate) -> list[Edge]:
-        """Return the loops that agree with this one, if there are enough; otherwise none, and the candidate waits."""
+        """Return this loop and those that agree with it, if there are enough. Otherwise, let the candidate wait."""
         here = candidate.edge.b
-        # A keyframe removed in the meantime is not a node of the graph.
+        # Drop loops whose keyframe has been removed from the graph in the meantime.
         self._pending = [
             other
             for other in self._pending
@@ -314,7 +313,7 @@ class LoopClosure:
         return [other.edge for other in agreeing] + [candidate.edge]
 
     def _consistent(self, one: Edge, two: Edge) -> bool:
-        """Return whether two loops agree: the cycle through both loops and the graph closes without error."""
+        """Return whether two loops agree, so that the cycle through both and the graph closes without error."""
         start = relative2(self._poses[one.a], self._poses[two.a])
         end = relative2(self._poses[one.b], self._poses[two.b])
         rest = relative2(compose2(one.a_from_b, end), compose2(start, two.a_from_b))
@@ -333,7 +332,7 @@ class LoopClosure:
                 step = self._poses[k + 1, :2] - self._poses[k, :2]
                 drift = grown_drift(drift, step, float(self._poses[k, 2]), self._keyframes[k + 1].step_covariance)
 
-    # -- keeping it small -------------------------------------------------------------------------
+    # -- removal of keyframes ---------------------------------------------------------------------
 
     def _thin_out(self, k: int) -> None:
         """Remove keyframe ``k`` if enough older ones cover its place, so that a known area has a constant cost."""
@@ -343,7 +342,7 @@ class LoopClosure:
         near = np.hypot(apart[:, 0], apart[:, 1]) <= SAME_PLACE_M
         near &= np.abs(np.arctan2(np.sin(apart[:, 2]), np.cos(apart[:, 2]))) <= SAME_PLACE_RAD
         near &= self._alive[:k]
-        # the robot's own recent track is not a return to a known place
+        # The robot's own recent track is not a return to a known place.
         near[max(0, k - 2 * LOCAL_KEYFRAMES) :] = False
         if int(near.sum()) < SAME_PLACE:
             return
@@ -375,7 +374,7 @@ class LoopClosure:
         return math.hypot(error[0], error[1]) <= within_m and abs(float(error[2])) <= within_rad
 
     def _optimise(self, accepted: Sequence[Edge]) -> bool:
-        """Optimise the poses over all edges; remove loops that the rest of the graph contradicts."""
+        """Optimise the poses over all edges, and remove loops that the rest of the graph contradicts."""
         self._unsettled = 0
         alive = np.flatnonzero(self._alive[: len(self)])
         index = {int(k): row for row, k in enumerate(alive)}
@@ -399,7 +398,7 @@ class LoopClosure:
         turned = float(np.abs(np.arctan2(np.sin(moved[:, 2]), np.cos(moved[:, 2]))).max()) if built else math.inf
         if far < 0.5 * self.config.map.resolution_m and turned < 0.005:
             return None
-        # A rebuild takes time in proportion to the number of keyframes; at this rate the cost per new keyframe is
+        # The time of a rebuild is proportional to the number of keyframes. At this rate, the cost per new keyframe is
         # constant.
         if not last and far < 0.2 and turned < 0.05 and count - built < max(20, count // 10):
             return None
@@ -411,12 +410,12 @@ class LoopClosure:
 
 
 def _loop_covariance(covariance: FloatArray, yaw: float) -> FloatArray:
-    """Return the covariance of a loop in the frame of its start, which has the heading ``yaw`` in the map."""
+    """Return the covariance of a loop in the frame of its start, whose heading in the map is ``yaw``."""
     return turned(covariance, -yaw) + np.diag(np.square([LOOP_SIGMA_M, LOOP_SIGMA_M, LOOP_SIGMA_RAD]))
 
 
 def reversed_edge(edge: Edge) -> Edge:
-    """Return the same edge seen from its other end."""
+    """Return an edge in the opposite direction."""
     b_from_a = inverse2(edge.a_from_b)
     carry = np.eye(3)
     carry[0, 2], carry[1, 2] = edge.a_from_b[1], -edge.a_from_b[0]
@@ -425,7 +424,7 @@ def reversed_edge(edge: Edge) -> Edge:
 
 
 def chained(first: Edge, second: Edge) -> Edge:
-    """Compose two edges: from the start of the first to the end of the second, which starts where the first ends."""
+    """Compose two edges, of which the second starts where the first ends."""
     a_from_c = compose2(first.a_from_b, second.a_from_b)
     way = a_from_c[:2] - first.a_from_b[:2]
     covariance = grown_drift(first.covariance, way, float(first.a_from_b[2]), second.covariance)
@@ -433,7 +432,7 @@ def chained(first: Edge, second: Edge) -> Edge:
 
 
 def gather(poses: Sequence[FloatArray], scans: Sequence[ScanPoints]) -> FloatArray:
-    """Return the points of scans at poses (3,), in the frame of the last pose, evenly spread, (n, 2)."""
+    """Return the points of scans at their poses (3,), in the frame of the last pose and evenly spread, (n, 2)."""
     parts = []
     for pose, scan in zip(poses, scans, strict=True):
         x, y, yaw = relative2(poses[-1], pose)
@@ -444,5 +443,5 @@ def gather(poses: Sequence[FloatArray], scans: Sequence[ScanPoints]) -> FloatArr
 
 
 def correction(before: FloatArray, after: FloatArray) -> FloatArray:
-    """Transform (3,) that moves ``before`` to ``after``: ``after ∘ before⁻¹``."""
+    """Return the transform (3,) that moves ``before`` to ``after``: ``after ∘ before⁻¹``."""
     return compose2(after, inverse2(before))

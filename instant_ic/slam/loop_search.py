@@ -1,8 +1,8 @@
-"""Search for recent scans in an older part of the map, metres away from their estimated pose if need be.
+"""Search for recent scans in an older part of the map, up to metres away from their estimated pose.
 
-Coarse to fine, after Olson (2015). Every pose of a wide window is scored on a pooled field, whose cells hold the best
-value nearby. The best poses that are far enough apart are then searched on the full field and refined. The score of the
-second best place shows whether the result is unique.
+The search is coarse to fine, after Olson (2015). Every pose of a wide window is scored on a pooled field, whose cells
+hold the best value nearby. The surroundings of the best poses that are far enough apart are then searched on the full
+field and refined. The score of the second best place shows whether the result is unique.
 """
 
 from __future__ import annotations
@@ -21,36 +21,36 @@ from instant_ic.slam.matcher import correlate, refine
 from instant_ic.slam.scan import FloatArray
 
 MIN_PLACE_SCORE = 0.6
-"""Minimum match score (0..1) of a loop, and of the robot's place in a saved map."""
+"""Minimum match score (0..1) of a loop and of the robot's place in a saved map."""
 POOL = 4
-"""Field cells along a side of a pooled cell."""
+"""Number of field cells along a side of a pooled cell."""
 
 COARSE_POINTS = 100
-"""Number of query points in the wide search; the fine search uses all."""
+"""Number of query points in the wide search. The fine search uses all points."""
 ROTATION_STEP_RAD = 0.035
-"""Heading step of the coarse search: at 6 m, the side of a pooled cell."""
+"""Heading step of the coarse search, which at 6 m is the side of a pooled cell."""
 CANDIDATES = 12
-"""Number of coarse peaks to refine."""
+"""Number of coarse peaks that are refined."""
 APART_M, APART_RAD = 0.6, 0.3
-"""Poses this far apart, or turned by this much, are different places."""
-LEAST = np.float64(0.05)  # float32 would round it up, and leave out a cell of just this value
-"""Values of the field up to it count as 0 in the pooled one."""
+"""Distance, or difference in heading, beyond which two poses are different places."""
+LEAST = np.float64(0.05)  # float32 would round it up and so change the result for this value
+"""Largest value of the field that counts as 0 in the pooled field."""
 
 
 def pool(field: NDArray[np.float32], size: int) -> NDArray[np.float32]:
     """Return the best value near each pooled cell.
 
     Args:
-        field: (H, W).
-        size: cells along a side of a pooled cell.
+        field: likelihood field, (H, W).
+        size: number of field cells along a side of a pooled cell.
 
     Returns:
-        (ceil(H/size), ceil(W/size)); cell (j, i) holds the maximum within ``size`` cells of the field's cell
-        (j·size, i·size) along either axis.
+        Pooled field, (ceil(H/size), ceil(W/size)). Cell (j, i) holds the maximum within ``size`` cells of the field's
+        cell (j·size, i·size) along either axis.
     """
     height, width = field.shape
     whole = np.pad(field, ((0, -height % size), (0, -width % size)))
-    # Whole rows first: a maximum over both axes of a block at once takes ten times as long.
+    # Reduce whole rows first. A maximum over both axes of a block at once takes ten times as long.
     rows = functools.reduce(np.maximum, [whole[k::size] for k in range(size)])
     blocks = functools.reduce(np.maximum, [rows[:, k::size] for k in range(size)])
     blocks[~(blocks > LEAST)] = 0.0
@@ -63,10 +63,10 @@ def pool(field: NDArray[np.float32], size: int) -> NDArray[np.float32]:
 def score_volume(field, origin, resolution, points, centre, cells, rotations, rotation_step):  # type: ignore[no-untyped-def]
     """Return the mean field value of the points at each pose of a window.
 
-    Arguments as of `matcher.correlate`.
+    The arguments are those of `matcher.correlate`.
 
     Returns:
-        float32 (2·rotations + 1, 2·cells + 1, 2·cells + 1): rotation, y, x.
+        Scores by rotation, y and x, (2·rotations + 1, 2·cells + 1, 2·cells + 1) float32.
     """
     height, width = field.shape
     n = points.shape[0]
@@ -90,7 +90,7 @@ def score_volume(field, origin, resolution, points, centre, cells, rotations, ro
 
 
 def peaks(volume: NDArray[np.float32], count: int, apart: int, apart_rotations: int) -> NDArray[np.int64]:
-    """Return the best poses of a score volume, each apart from every better one; rows of rotation, y, x indices."""
+    """Return the best poses of a score volume that are apart from every better one, as rotation, y and x indices."""
     left, found = volume.copy(), list[NDArray[np.int64]]()
     reach = np.array([apart_rotations, apart, apart])
     while len(found) < count:
@@ -107,11 +107,11 @@ class Found:
     """Pose at which the query fits.
 
     Attributes:
-        pose: field_from_base (3,).
-        covariance: (3, 3) in the field's frame, of the scans alone.
-        score: 0..1, mean field value over the points.
+        pose: field_from_base, (3,).
+        covariance: covariance from the scans alone, in the field's frame, (3, 3).
+        score: mean field value over the points, 0..1.
         shape: ratio of smallest to largest information over all directions, 0..1; near 0 in a bare corridor.
-        runner_up: score of the best different place; 0 if there is none.
+        runner_up: score of the second best place; 0 if there is none.
     """
 
     pose: FloatArray
@@ -124,7 +124,7 @@ class Found:
 def find_place(
     field: LikelihoodField, points: FloatArray, centre: FloatArray, reach_m: float, reach_rad: float
 ) -> Found | None:
-    """Return the best pose of ``points`` (n, 2) within ``reach_m``, ``reach_rad`` of ``centre`` (3,), or None."""
+    """Return the best pose of ``points`` (n, 2) within ``reach_m`` and ``reach_rad`` of ``centre`` (3,), or None."""
     resolution = field.resolution
     coarse = POOL * resolution
     cells = max(1, math.ceil(reach_m / coarse))
@@ -138,7 +138,7 @@ def find_place(
     for r, j, i in tops:
         start = centre + np.array([(i - cells) * coarse, (j - cells) * coarse, (r - rotations) * ROTATION_STEP_RAD])
         if close and volume[r, j, i] < close[0].score - 0.1:
-            break  # a pooled score is close to an upper bound: no later candidate can be near the best
+            break  # a pooled score is close to an upper bound, so no later candidate can come near the best
         one = refined(field, points, start)
         if one is not None:
             close.append(one)
@@ -152,7 +152,7 @@ def find_place(
 def refined(field: LikelihoodField, points: FloatArray, start: FloatArray) -> Found | None:
     """Return the best pose of ``points`` (n, 2) within a pooled cell and a heading step of ``start`` (3,).
 
-    None if the points give no information.
+    Return None if the points give no information.
     """
     none = np.zeros(3)
     x, y, yaw, _ = correlate(
@@ -165,7 +165,7 @@ def refined(field: LikelihoodField, points: FloatArray, start: FloatArray) -> Fo
     )
     try:
         covariance = max(squares / max(len(points) - 3, 1), 1e-3) * np.linalg.inv(hessian)
-        # Information on translation with unknown heading: the Schur complement.
+        # The Schur complement is the information on the translation at unknown heading.
         known = hessian[:2, :2] - np.outer(hessian[:2, 2], hessian[2, :2]) / hessian[2, 2]
         low, high = np.linalg.eigvalsh(known)
     except np.linalg.LinAlgError:
@@ -182,7 +182,7 @@ def apart(a: FloatArray, b: FloatArray) -> bool:
 
 
 def spread(points: FloatArray, cell_m: float, max_points: int) -> FloatArray:
-    """Return the one point per cell of ``cell_m``, at most ``max_points``, evenly chosen, (n, 2)."""
+    """Return one point per cell of side ``cell_m``, (n, 2); at most ``max_points``, evenly chosen."""
     if len(points) == 0:
         return points
     _, first = np.unique(np.floor(points / cell_m).astype(np.int64), axis=0, return_index=True)
@@ -196,5 +196,5 @@ def warm_up() -> None:
     """Compile the kernels of the search."""
     field = LikelihoodField(resolution_m=0.05, reach_m=5.0)
     field.values[:] = 0.5
-    # More points than the coarse search takes: of these it takes every second.
+    # Use more points than the coarse search takes, so that the code for an even choice is compiled too.
     find_place(field, np.zeros((2 * COARSE_POINTS, 2)), np.zeros(3), reach_m=0.5, reach_rad=0.1)

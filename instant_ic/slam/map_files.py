@@ -1,6 +1,7 @@
 """Maps on disk: ``NAME.yaml`` and ``NAME.pgm`` in ROS format, and ``NAME.graph.npz`` for extending the map.
 
-The image follows map_saver and map_server (nav2): 0 occupied, 254 free, 205 unknown; the top row has the largest y.
+The image follows map_saver and map_server (nav2): 0 is occupied, 254 free, 205 unknown, and the top row has the largest
+y.
 """
 
 from __future__ import annotations
@@ -23,12 +24,12 @@ from instant_ic.util.limits import check_arrays, load_image
 
 OCCUPIED_THRESH, FREE_THRESH = 0.65, 0.25
 WRITTEN_FREE_THRESH = 0.196
-"""Grey 205 is 0.1961 occupied; a reader with this threshold keeps it unknown."""
+"""Free threshold in written files. It is below 0.1961, the occupancy of grey 205, so that readers keep 205 unknown."""
 _GRAPH_VERSION = 1
 
 
 class MapError(ValueError):
-    """A map cannot be written or read; the message names the file and the reason."""
+    """A map cannot be written or read."""
 
 
 def graph_file(stem: Path) -> Path:
@@ -39,13 +40,13 @@ def graph_file(stem: Path) -> Path:
 def ros_map(
     values: NDArray[np.int8], resolution: float, origin: Sequence[float] | NDArray[np.float64], image: str
 ) -> tuple[NDArray[np.uint8], str]:
-    """Return the image (H, W), largest y on top, and YAML text of a map, as map_server reads them.
+    """Return the image (H, W), largest y on top, and the YAML text of a map, in map_server's format.
 
     Args:
-        values: cells (H, W), lowest y first; 0..100, -1 unknown.
+        values: cells, (H, W), lowest y first: 0..100, or -1 if unknown.
         resolution: metres per cell.
-        origin: lower left corner (x, y), m.
-        image: file name of the image, written to the YAML text.
+        origin: lower left corner (x, y) in metres.
+        image: file name of the image, for the YAML text.
 
     Raises:
         MapError: the map is empty.
@@ -64,7 +65,7 @@ def ros_map(
 
 
 def save_grid(stem: Path, grid: OccupancyGrid) -> list[Path]:
-    """Write ``stem.pgm`` and ``stem.yaml`` and return them.
+    """Write ``stem.pgm`` and ``stem.yaml``, and return their paths.
 
     Raises:
         MapError: the map is empty, or the folder is not writable.
@@ -84,8 +85,8 @@ def save_grid(stem: Path, grid: OccupancyGrid) -> list[Path]:
 def load_grid(path: Path) -> OccupancyGrid:
     """Read a ROS map from its YAML file, given with or without extension.
 
-    Cells are free, occupied or unknown, as in map_server's mode ``trinary``; the image may be PGM or any format that
-    OpenCV reads.
+    Cells are free, occupied or unknown, as in map_server's mode ``trinary``. The image may have any format that OpenCV
+    reads.
 
     Raises:
         MapError: a file is missing or invalid.
@@ -119,7 +120,7 @@ def load_grid(path: Path) -> OccupancyGrid:
     image = path.parent / str(content.get("image", ""))
     try:
         found = image.is_file()
-    except (OSError, ValueError):  # not a possible file name
+    except (OSError, ValueError):  # the name cannot be a file name
         found = False
     if not found:
         raise MapError(f"{path}: image {image} does not exist")
@@ -133,7 +134,7 @@ def load_grid(path: Path) -> OccupancyGrid:
     except yaml.YAMLError as error:
         raise MapError(f"{path}: negate must be 0 or 1: {error}") from None
     share = grey / 255 if negate else (255 - grey) / 255
-    # Grey 205 is unknown, whatever the threshold: nav2 writes 0.25, which would make it free.
+    # Grey 205 is unknown at any threshold. nav2 writes the threshold 0.25, which would make 205 free.
     unknown = (grey == 205) & (not negate)
     values[(share < free) & ~unknown] = 0
     values[share > occupied] = 100
@@ -141,7 +142,7 @@ def load_grid(path: Path) -> OccupancyGrid:
 
 
 _MOST_NUMBER = 1e9
-"""Larger than any coordinate in metres; YAML allows NaN, infinity, and integers too large for a float."""
+"""Bound of all numbers in a map file. YAML also allows NaN, infinity, and integers too large for a float."""
 
 
 def _number(path: Path, content: dict[str, Any], key: str, default: float | None) -> float:
@@ -156,14 +157,14 @@ def _checked_number(what: str, value: Any) -> float:
 
 
 def occupied_points(grid: OccupancyGrid) -> FloatArray:
-    """Return the centres of the occupied cells in the map, (n, 2)."""
+    """Return the centres of the occupied cells in the map frame, (n, 2)."""
     rows, columns = np.nonzero(grid.values >= round(100 * OCCUPIED_THRESH))
     points: FloatArray = grid.origin + grid.resolution * (np.column_stack([columns, rows]) + 0.5)
     return points
 
 
 def save_graph(stem: Path, keyframes: Sequence[ScanKeyframe], edges: Sequence[Edge]) -> Path:
-    """Write keyframes and edges to ``stem.graph.npz`` and return it.
+    """Write keyframes and edges to ``stem.graph.npz``, and return its path.
 
     Raises:
         MapError: the file cannot be written.
@@ -196,7 +197,7 @@ _MATRICES = ("step_covariance", "drift")
 
 
 def load_graph(stem: Path) -> tuple[list[ScanKeyframe], list[Edge]]:
-    """Read a file written by `save_graph`.
+    """Read keyframes and edges from a file written by `save_graph`.
 
     Raises:
         MapError: the file is missing or is not a saved graph.

@@ -1,8 +1,8 @@
 """Scan matching against a likelihood field: correlative search, then Gauss-Newton.
 
-The search scores every pose of a window (Olson, Real-time correlative scan matching, ICRA 2009); the refinement
+The search scores every pose of a window (Olson, Real-time correlative scan matching, ICRA 2009). The refinement
 minimises ``Σ (1 − M(T·p))²`` (Kohlbrecher et al., Hector SLAM, 2011). Both use the odometry guess as a Gaussian prior.
-Along a featureless corridor, where the field is flat, odometry therefore decides.
+Odometry therefore decides along a featureless corridor, where the field is flat.
 """
 
 from __future__ import annotations
@@ -19,16 +19,16 @@ from instant_ic.slam.likelihood_field import LikelihoodField
 from instant_ic.slam.scan import FloatArray
 
 RESIDUAL_SIGMA = 0.6
-"""Standard deviation (1σ) of ``1 − M`` for a point on its surface: smaller trusts the scan more, and odometry, which
+"""Standard deviation of ``1 − M`` for a point on its surface. A smaller value trusts the scan more and odometry, which
 decides in bare corridors, less."""
 ODOMETRY_CUTOFF = 4.0
-"""Distance from the guess, in σ, beyond which its pull hardly grows: odometry may be entirely wrong."""
+"""Distance from the guess, in σ, beyond which its cost hardly grows, because odometry may be entirely wrong."""
 COARSE_STEP_RAD, FINE_STEP_RAD = 0.02, 0.005
-"""Heading steps of the two searches; at 2.5 m the coarse one is a cell of the field."""
+"""Heading steps of the two searches. At 2.5 m, the coarse step is a cell of the field."""
 LEAST_INFORMATION = 0.01
-"""1/m² and 1/rad²; keeps the information of a scan along a bare corridor invertible."""
+"""Information added in 1/m² and 1/rad², which keeps that of a scan along a bare corridor invertible."""
 REFINE_ITERATIONS = 20
-"""Maximum number of Gauss-Newton steps; they end earlier once the step is below 0.01 mm."""
+"""Maximum number of Gauss-Newton steps. They end earlier once the step is below 0.01 mm."""
 
 
 @njit(cache=True)
@@ -39,19 +39,19 @@ def correlate(  # type: ignore[no-untyped-def]
 
     The value of a pose is ``gain·mean(field at the points) − ½ c²·ln(1 + e²/c²)``. ``e²`` is its squared distance from
     ``guess`` in the metric of ``information``, with translation in the guess's own axes (along and across the direction
-    of travel). ``c`` is the ``cutoff``: it limits the cost of a guess that is far off.
+    of travel). ``c`` is the ``cutoff``, which limits the cost of a guess that is far off.
 
     Args:
-        field: float32 (H, W).
-        origin: (2,) centre of cell (0, 0).
+        field: likelihood field, (H, W) float32.
+        origin: centre of cell (0, 0), (2,).
         resolution: metres per cell.
-        points: (n, 2) in the base frame, n > 0.
-        centre: field_from_base (3,), middle of the window.
-        cells: half width of the window.
-        rotations: half its number of rotations.
-        rotation_step: radians.
-        guess: field_from_base (3,), the prior's mean.
-        information: (3,) along, across, rotation; the prior's inverse variances.
+        points: points in the base frame, (n, 2), n > 0.
+        centre: field_from_base at the middle of the window, (3,).
+        cells: half width of the window in cells.
+        rotations: number of rotations to either side of the middle.
+        rotation_step: heading step in radians.
+        guess: field_from_base, the prior's mean, (3,).
+        information: inverse variances of the prior along, across and in rotation, (3,).
         cutoff: distance from the guess beyond which its cost hardly grows, in σ.
         gain: weight of the mean field value against the prior.
 
@@ -65,7 +65,7 @@ def correlate(  # type: ignore[no-untyped-def]
     best_value = -1e30
     best_x, best_y, best_yaw = centre[0], centre[1], centre[2]
     cos_guess, sin_guess = math.cos(guess[2]), math.sin(guess[2])
-    # From the middle outwards: among equal poses the one nearest to the centre wins.
+    # Search from the middle outwards, so that among equal poses the one nearest to the centre wins.
     for turn in range(2 * rotations + 1):
         r = (turn + 1) // 2 if turn % 2 == 1 else -(turn // 2)
         yaw = centre[2] + r * rotation_step
@@ -89,7 +89,7 @@ def correlate(  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def _add_field(field, origin, resolution, points, x0, y0, yaw, sums):  # type: ignore[no-untyped-def]
-    """Set ``sums`` (2·cells + 1, 2·cells + 1) to the field's sums over the points, by translation about x0, y0."""
+    """Set ``sums`` (2·cells + 1, 2·cells + 1) to the sum of the field over the points for translations about x0, y0."""
     height, width = field.shape
     size = sums.shape[0]
     cells = size // 2
@@ -111,7 +111,7 @@ def _add_field(field, origin, resolution, points, x0, y0, yaw, sums):  # type: i
 def _normal_equations(  # type: ignore[no-untyped-def]
     field, origin, resolution, points, pose, guess, information, weight, hessian, gradient
 ):
-    """Set up the Gauss-Newton system of the cost at ``pose``: fills ``hessian`` (3, 3) and ``gradient`` (3,).
+    """Compute ``hessian`` (3, 3) and ``gradient`` (3,) of the Gauss-Newton system at ``pose``, in place.
 
     Returns:
         The cost, the mean field value over the points, the sum of squared residuals.
@@ -159,7 +159,7 @@ def _normal_equations(  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def _add_prior(pose, guess, information, hessian, gradient):  # type: ignore[no-untyped-def]
-    """Add the prior to the Gauss-Newton system, rotated from the guess's axes into the field's; return its cost."""
+    """Add the prior, rotated from the guess's axes into the field's, to the Gauss-Newton system. Return its cost."""
     cos_guess, sin_guess = math.cos(guess[2]), math.sin(guess[2])
     pxx = information[0] * cos_guess * cos_guess + information[1] * sin_guess * sin_guess
     pyy = information[0] * sin_guess * sin_guess + information[1] * cos_guess * cos_guess
@@ -180,7 +180,7 @@ def _add_prior(pose, guess, information, hessian, gradient):  # type: ignore[no-
 
 @njit(cache=True)
 def _solve(hessian, gradient, damping):  # type: ignore[no-untyped-def]
-    """Solve the damped system by Cramer's rule; zero step if it is singular."""
+    """Solve the damped system by Cramer's rule. The step is zero if the system is singular."""
     a = hessian[0, 0] * (1 + damping)
     b, c = hessian[0, 1], hessian[0, 2]
     d = hessian[1, 1] * (1 + damping)
@@ -199,10 +199,10 @@ def _solve(hessian, gradient, damping):  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def refine(field, origin, resolution, points, start, guess, information, weight, iterations, reach, turn):  # type: ignore[no-untyped-def]
-    """Minimise, by Levenberg-Marquardt from ``start`` (3,), ``½ weight Σ(1 − M)² + ½ eᵀ·diag(information)·e``.
+    """Minimise ``½ weight Σ(1 − M)² + ½ eᵀ·diag(information)·e`` by Levenberg-Marquardt from ``start`` (3,).
 
-    The result stays within ``reach`` metres of ``start`` along x and y and within ``turn`` radians: the search has
-    already rejected everything beyond.
+    The result stays within ``reach`` metres of ``start`` along x and y and within ``turn`` radians, because the search
+    has already rejected everything beyond.
 
     Returns:
         The pose (3,), the Hessian there (3, 3), the mean field value, the sum of squared residuals.
@@ -250,11 +250,11 @@ class Match:
     """Pose at which a scan fits.
 
     Attributes:
-        pose: field_from_base (3,).
-        covariance: (3, 3) in the field's frame.
-        score: 0..1, mean field value over the points.
-        at_border: the search ended at the edge of its window, so a better pose may lie outside.
-        scan_covariance: (3, 3) in the field's frame, of the scan alone, without the guess.
+        pose: field_from_base, (3,).
+        covariance: covariance of the pose in the field's frame, (3, 3).
+        score: mean field value over the points, 0..1.
+        at_border: true if the search ended at the edge of its window, so that a better pose may lie outside.
+        scan_covariance: covariance from the scan alone, without the guess, in the field's frame, (3, 3).
     """
 
     pose: FloatArray
@@ -267,14 +267,14 @@ class Match:
 def match_scan(
     field: LikelihoodField, points: FloatArray, guess: FloatArray, sigma: FloatArray, window: SearchWindow
 ) -> Match:
-    """Find the pose of ``points`` (n, 2), n > 0, in a likelihood field, in a window around a guess.
+    """Find the pose of a scan in a likelihood field, within a window around a guess.
 
     Args:
         field: the local map.
-        points: points of the scan in the base frame, (n, 2).
-        guess: field_from_base (3,).
-        sigma: standard deviations (3,) of the guess: along, across, rotation.
-        window: how far from the guess to search.
+        points: points of the scan in the base frame, (n, 2), n > 0.
+        guess: predicted field_from_base, (3,).
+        sigma: standard deviations of the guess along, across and in rotation, (3,).
+        window: half widths of the search around the guess.
     """
     information = 1.0 / np.square(sigma)
     weight = 1.0 / RESIDUAL_SIGMA**2
@@ -295,14 +295,14 @@ def match_scan(
         field.values, field.origin, resolution, points, np.array([x, y, yaw]), 1, finer, FINE_STEP_RAD, guess,
         information, ODOMETRY_CUTOFF, gain,
     )  # fmt: skip
-    # Keep the prior's weight fixed at its value at the best pose of the search.
+    # During refinement, keep the prior's weight at the best pose of the search.
     error = relative2(guess, np.array([x, y, yaw]))
     information = information / (1.0 + float(information @ error**2) / ODOMETRY_CUTOFF**2)
     pose, hessian, score, squares = refine(
         field.values, field.origin, resolution, points, np.array([x, y, yaw]), guess, information, weight,
         REFINE_ITERATIONS, 3 * resolution, 2 * COARSE_STEP_RAD,
     )  # fmt: skip
-    # The residuals measure the quality of the fit: a poor fit gets a wide covariance.
+    # Scale the covariance by the residuals, so that a poor fit gets a wide one.
     variance = max(squares / max(len(points) - 3, 1), 1e-3) * weight
     covariance = variance * np.linalg.inv(hessian)
     scan_information = hessian - turned(np.diag(information), float(guess[2])) + LEAST_INFORMATION * np.eye(3)

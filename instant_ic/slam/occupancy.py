@@ -1,4 +1,4 @@
-"""Occupancy grid by ray casting: log-odds cells, updated scan by scan; the grid grows with the map.
+"""Occupancy grid by ray casting: log-odds cells that each scan updates. The grid grows with the map.
 
 Log-odds as in Thrun, Burgard, Fox, Probabilistic Robotics, 9.2. A scan changes a cell at most once. A hit outweighs the
 rays of the same scan that pass through the cell, so that walls seen at a grazing angle are kept.
@@ -26,18 +26,18 @@ def _log_odds(probability: float) -> float:
 
 
 HIT, MISS = _log_odds(0.7), _log_odds(0.4)
-"""Log-odds added to a cell in which a beam ended, and to one that a beam passed through."""
+"""Log-odds added to a cell in which a beam ended, and to a cell that a beam has passed through."""
 LOW, HIGH = _log_odds(0.03), _log_odds(0.97)
-"""Limits of a cell's log-odds, so that changes of the place become visible after a few scans."""
+"""Limits of a cell's log-odds, so that changes become visible after a few scans."""
 
 
 class OccupancyGrid(NamedTuple):
     """A map as in nav_msgs/OccupancyGrid.
 
     Attributes:
-        values: int8 (H, W), −1 unknown, 0..100 probability of being occupied; row 0 has the lowest y.
+        values: probability of being occupied in per cent, −1 if unknown, (H, W) int8; row 0 has the lowest y.
         resolution: metres per cell.
-        origin: (2,) map coordinates of the lower left corner of cell (0, 0).
+        origin: map coordinates of the lower left corner of cell (0, 0), (2,).
     """
 
     values: NDArray[np.int8]
@@ -49,7 +49,7 @@ class OccupancyGrid(NamedTuple):
 def _cast(cells, seen, mark, x0, y0, x1, y1):  # type: ignore[no-untyped-def]
     """Add ``MISS`` to every cell from (x0, y0) up to, but excluding, the cell of (x1, y1) (Amanatides and Woo, 1987).
 
-    Coordinates in cells; cell i covers i..i + 1.
+    Coordinates are in cells; cell i covers i..i + 1.
     """
     height, width = cells.shape
     ix, iy = math.floor(x0), math.floor(y0)
@@ -77,18 +77,18 @@ def _cast(cells, seen, mark, x0, y0, x1, y1):  # type: ignore[no-untyped-def]
 def cast_scan(  # type: ignore[no-untyped-def]
     cells, seen, mark, origin, resolution, pose, laser, points, max_range
 ):
-    """Add one scan to log-odds ``cells`` float32 (H, W).
+    """Add one scan to a map.
 
     Args:
-        cells: changed in place.
-        seen: int32 (H, W), set to ``mark`` where this scan changes a cell.
-        mark: number of the scan, from 1 on.
-        origin: (2,) corner of cell (0, 0).
+        cells: log-odds, (H, W) float32; changed in place.
+        seen: number of the scan that last changed a cell, (H, W) int32; changed in place.
+        mark: number of this scan, from 1 on.
+        origin: corner of cell (0, 0), (2,).
         resolution: metres per cell.
-        pose: map_from_base (3,).
-        laser: (2,) the laser's centre in the base frame.
-        points: (n, 2) hits in the base frame.
-        max_range: metres; a farther hit only clears the cells up to it.
+        pose: map_from_base, (3,).
+        laser: centre of the laser in the base frame, (2,).
+        points: hits in the base frame, (n, 2).
+        max_range: longest ray in metres; a hit beyond it only clears cells up to this range.
     """
     height, width = cells.shape
     cos_yaw, sin_yaw = math.cos(pose[2]), math.sin(pose[2])
@@ -131,8 +131,8 @@ class OccupancyMap:
     """A growing occupancy grid.
 
     Attributes:
-        version: grows with every change.
-        clipped: number of points dropped because they lie outside ``max_size_m`` about the first pose.
+        version: counter that grows with every change.
+        clipped: number of points dropped because they lie outside ``max_size_m`` around the first pose.
     """
 
     def __init__(self, config: MapConfig) -> None:
@@ -163,7 +163,7 @@ class OccupancyMap:
 
     @classmethod
     def of_grid(cls, grid: OccupancyGrid) -> OccupancyMap:
-        """Return a map with the walls, the free and the unknown cells of a grid, to compare scans with."""
+        """Return a map with the occupied, free and unknown cells of a grid, for comparison with scans."""
         made = cls(MapConfig(resolution_m=grid.resolution))
         made._first = np.round(grid.origin / grid.resolution).astype(np.int64)
         made._cells = np.where(grid.values >= 50, HIGH, LOW).astype(np.float32)
@@ -171,13 +171,13 @@ class OccupancyMap:
         return made
 
     def copy(self) -> OccupancyMap:
-        """Return a copy that later scans leave as it is."""
+        """Return a copy that later scans do not change."""
         made = copy.copy(self)
         made._cells, made._seen = self._cells.copy(), self._seen.copy()
         return made
 
     def contradiction(self, map_from_base: FloatArray, scan: ScanPoints, newest: int | None = None) -> float:
-        """Return the share of rays, 0..1, that contradict the map or its ``newest`` scans (`contradiction`)."""
+        """Return the share of rays, 0..1, that contradict the map or only its ``newest`` scans; see `contradiction`."""
         resolution, since = self.config.resolution_m, 1 if newest is None else max(1, self._mark - newest + 1)
         return contradiction(self._cells, self._seen, self.origin, resolution, map_from_base, scan, since)
 
@@ -186,7 +186,7 @@ class OccupancyMap:
         return OccupancyGrid(_percentages(self._cells, self._seen), self.config.resolution_m, self.origin)
 
     def _grow(self, pose: FloatArray, scan: ScanPoints) -> None:
-        """Extend the grid to cover the scan, in steps of GROW_CELLS, up to ``max_size_m`` about the first pose."""
+        """Extend the grid to cover the scan, in steps of GROW_CELLS, up to ``max_size_m`` around the first pose."""
         cos_yaw, sin_yaw = math.cos(pose[2]), math.sin(pose[2])
         rotation = np.array([[cos_yaw, -sin_yaw], [sin_yaw, cos_yaw]])
         rays = np.concatenate([scan.points, scan.origin[None]]) - scan.origin

@@ -1,4 +1,4 @@
-"""Buffer of wheel odometry, interpolated at scan stamps; and the smoothing of map→odom."""
+"""Wheel odometry interpolated at scan stamps, and smoothing of map→odom."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from instant_ic.slam.scan import FloatArray
 
 
 class OdometryBuffer:
-    """Recent odometry: poses odom_from_base (3,) by time.
+    """Recent poses odom_from_base (3,) by time.
 
     Args:
         keep_s: length of the history in seconds.
@@ -30,7 +30,7 @@ class OdometryBuffer:
         return self._stamps[-1] if self._stamps else None
 
     def add(self, stamp_ns: int, odom_from_base: FloatArray) -> bool:
-        """Append a pose. Return False, without adding it, if it is not newer than the last or not finite."""
+        """Append a pose, unless it is not newer than the last or not finite. Return whether it was added."""
         if not np.isfinite(odom_from_base).all() or (self._stamps and stamp_ns <= self._stamps[-1]):
             return False
         self._stamps.append(stamp_ns)
@@ -47,8 +47,8 @@ class OdometryBuffer:
     def at(self, stamp_ns: int, extrapolate_s: float = 0.0) -> FloatArray | None:
         """Return the pose (3,) at a time, along the arc between its neighbours.
 
-        After the newest pose the last motion is extrapolated by at most ``extrapolate_s``. None if the time is not
-        covered.
+        After the newest pose, the last motion is extrapolated by at most ``extrapolate_s``. Return None if the time is
+        not covered.
         """
         if not self._stamps or stamp_ns < self._stamps[0]:
             return None
@@ -70,7 +70,7 @@ def _part_of_arc(step: FloatArray, part: float) -> FloatArray:
     """Return the fraction ``part`` of a planar step (3,) along its circular arc."""
     x, y, turn = step.tolist()
     half = 0.5 * turn
-    # The logarithm of SE(2): turn the chord back by half the turn, and stretch it to the arc.
+    # Logarithm of SE(2): turn the chord back by half the turn, and stretch it to the length of the arc.
     arc_over_chord = half / math.sin(half) if half != 0.0 else 1.0
     c, s = math.cos(half) * arc_over_chord, math.sin(half) * arc_over_chord
     forward, sideways = c * x + s * y, c * y - s * x
@@ -78,17 +78,17 @@ def _part_of_arc(step: FloatArray, part: float) -> FloatArray:
 
 
 SPEED_MPS, YAW_RATE_RADPS = 1.0, 1.0
-"""Speed limits of a correction, for the base's position in the map and its heading."""
+"""Speed limits of a correction of the base's position in the map and of its heading."""
 JUMP_M, JUMP_RAD = 0.5, 0.5
-"""A larger correction is broadcast at once."""
+"""Correction above which the new value is broadcast at once."""
 
 
 class CorrectionLimiter:
     """Makes map_from_odom follow its estimate at a limited speed.
 
-    A recovered track or a closed loop may correct the pose by decimetres at once; the limiter keeps the robot's pose in
-    the map continuous. Ordinary corrections of a few centimetres per scan pass unchanged. So does a correction by more
-    than ``JUMP_M`` or ``JUMP_RAD``: the old pose is wrong, and the longer it is broadcast, the longer it misleads.
+    A recovered track or a closed loop may correct the pose by decimetres at once. The limiter keeps the robot's pose in
+    the map continuous. Ordinary corrections of a few centimetres per scan pass unchanged. A correction above ``JUMP_M``
+    or ``JUMP_RAD`` also passes at once, because the old pose is wrong and would mislead as long as it is broadcast.
     """
 
     def __init__(self) -> None:
@@ -96,11 +96,11 @@ class CorrectionLimiter:
         self._stamp_ns = 0
 
     def reset(self) -> None:
-        """Pass the next value without limiting it."""
+        """Let the next value pass without a limit."""
         self._map_from_odom = None
 
     def follow(self, map_from_odom: FloatArray, odom_from_base: FloatArray, stamp_ns: int) -> FloatArray:
-        """Return the value to broadcast (3,): as close to the estimate as the speed limit at the base allows."""
+        """Return map_from_odom to broadcast (3,), as close to the estimate as the speed limits at the base allow."""
         if self._map_from_odom is None:
             limited = map_from_odom.copy()
         else:

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from instant_ic.slam.scan import FloatArray
 
 ROBUST_WIDTHS = (25e4, 25e2, 25.0)
-"""Width of the robust kernel per stage: an edge keeps its full weight up to this χ², and less beyond it."""
+"""Width of the robust kernel per stage: the χ² up to which an edge keeps its full weight."""
 ITERATIONS = 10
 """Maximum number of iterations per stage."""
 
@@ -28,11 +28,11 @@ class Edge:
     """A measured pose between two nodes.
 
     Attributes:
-        a: id of the node whose frame the pose is given in.
+        a: id of the node in whose frame the pose is given.
         b: id of the other node.
-        a_from_b: (3,).
-        covariance: (3, 3) in a's frame.
-        robust: True for an edge that may be wrong (loop closure), False for a step of the trajectory.
+        a_from_b: measured pose, (3,).
+        covariance: covariance of the pose in a's frame, (3, 3).
+        robust: true for an edge that may be wrong (loop closure), false for a step of the trajectory.
     """
 
     a: int
@@ -47,8 +47,8 @@ class Solution:
     """An optimised graph.
 
     Attributes:
-        poses: (n, 3).
-        weights: weight of each edge after the robust kernel (m,), 0..1; 1 for edges that are not robust.
+        poses: optimised poses, (n, 3).
+        weights: weight of each edge from the robust kernel, (m,), 0..1; 1 for edges that are not robust.
     """
 
     poses: FloatArray
@@ -56,7 +56,7 @@ class Solution:
 
 
 def residuals(poses: FloatArray, a: NDArray[np.intp], b: NDArray[np.intp], measured: FloatArray) -> FloatArray:
-    """Return the residual of each edge (m, 3) at poses (n, 3); ``a``, ``b`` (m,) index them; ``measured``: (m, 3)."""
+    """Return the residuals (m, 3) of edges between ``poses[a]`` and ``poses[b]`` with ``measured`` poses (m, 3)."""
     cos, sin = np.cos(poses[a, 2]), np.sin(poses[a, 2])
     dx, dy = (poses[b, :2] - poses[a, :2]).T
     turn = poses[b, 2] - poses[a, 2] - measured[:, 2]
@@ -65,12 +65,12 @@ def residuals(poses: FloatArray, a: NDArray[np.intp], b: NDArray[np.intp], measu
 
 
 def optimise(poses: FloatArray, edges: Sequence[Edge], index: dict[int, int]) -> Solution:
-    """Optimise the poses over all edges; the first node stays fixed.
+    """Optimise the poses over all edges. The first node stays fixed.
 
     Args:
-        poses: (n, 3), initial values.
-        edges: between the nodes.
-        index: row in ``poses`` of each node's id.
+        poses: initial poses, (n, 3).
+        edges: edges between the nodes.
+        index: row in ``poses`` of each node, by its id.
 
     Raises:
         ValueError: an edge refers to an unknown node, or part of the graph is not connected to the first node.
@@ -115,14 +115,14 @@ def optimise(poses: FloatArray, edges: Sequence[Edge], index: dict[int, int]) ->
 
 
 def _weights(chi2: FloatArray, robust: NDArray[np.bool_], width: float) -> FloatArray:
-    """Compute the dynamic covariance scaling: s = min(1, 2Φ/(Φ + χ²))."""
+    """Return the scales of dynamic covariance scaling: s = min(1, 2Φ/(Φ + χ²))."""
     if math.isinf(width):
         return np.ones(len(chi2))
     return np.where(robust, np.minimum(1.0, 2 * width / (width + chi2)), 1.0)
 
 
 def _robust_cost(chi2: FloatArray, robust: NDArray[np.bool_], width: float) -> float:
-    """Return the cost that dynamic covariance scaling minimises: sum of s²χ² + Φ(1 − s)²."""
+    """Return the cost that dynamic covariance scaling minimises, the sum of s²χ² + Φ(1 − s)²."""
     scale = _weights(chi2, robust, width)
     missing = 0.0 if math.isinf(width) else width * float(((1 - scale) ** 2).sum())
     return float((scale**2 * chi2).sum()) + missing

@@ -1,9 +1,9 @@
-"""Search for the robot in a map other than the one being made: a saved map, or that of the session before.
+"""Recognition of the robot's place in another map than the one being made: a saved map, or the previous session's.
 
 While the robot is not located in that map, it maps in a frame of its own (a session). A search finds the session's
-recent scans in the map (``localization``); the place that was found is recognized if the scans do not contradict the
-map there. The map of a session before is not complete: the true place may be missing in it, and another one look like
-it. A place far from where odometry says must therefore be found twice, from two places.
+recent scans in the map (``localization``). The place is recognized if the scans do not contradict the map there. The
+map of a previous session is incomplete: the true place may be missing, and another place may look like it. A place far
+from odometry's must therefore be found twice, from two positions of the robot.
 """
 
 from __future__ import annotations
@@ -27,13 +27,13 @@ class RelocalizationConfig:
     """Tuning of the recognition of a place.
 
     Attributes:
-        max_contradiction: contradiction of the session with the map above which they are not joined; a right place has
-            0.03.
+        max_contradiction: largest mean contradiction of the recent scans at which session and map are joined; it is
+            0.03 at the right place.
         near_m: distance from odometry's place up to which one finding is enough, in metres.
         near_rad: the same for the heading, in radians.
         agree_m: distance up to which two findings agree, in metres.
         agree_rad: the same for the heading, in radians.
-        confirm_after: way between two findings that confirm each other, metres plus radians.
+        confirm_after: smallest way between two findings that confirm each other, metres plus radians.
     """
 
     max_contradiction: float = 0.1
@@ -48,8 +48,8 @@ class Relocalization:
     """Finds the robot in a map.
 
     Args:
-        saved: the map.
-        by_odometry: whether odometry says where in the map the session began: it is the map of the session before.
+        saved: map in which the robot is searched for.
+        by_odometry: true if odometry gives the place in the map, because it is the map of the previous session.
 
     Attributes:
         reach_m: distance from odometry's place within which the robot is searched for, in metres.
@@ -64,22 +64,22 @@ class Relocalization:
 
     @cached_property
     def cells(self) -> OccupancyMap:
-        """The map as cells, to compare scans with."""
+        """The map as cells, for comparison with scans."""
         return OccupancyMap.of_grid(self.saved.grid)
 
     def lose(self, reach_m: float) -> None:
-        """Note that the robot is lost in the map, by at most ``reach_m`` metres from where odometry says."""
+        """Start a search for a lost robot, which is at most ``reach_m`` metres from odometry's place."""
         self.saved.located = False
         self.reach_m = self.config.near_m + reach_m
         self._found_before = None
 
     def recognized(self, recent: Sequence[ScanKeyframe], moved: FloatArray, here: FloatArray) -> bool:
-        """Return whether a place that was found is the true one.
+        """Return whether a place that was found is the true place.
 
         Args:
-            recent: the newest keyframes of the session.
-            moved: pose (3,) of the session's frame in the map, by the place.
-            here: pose (3,) of the scan that was found, in the session's frame.
+            recent: newest keyframes of the session.
+            moved: pose of the session's frame in the map that follows from the place, (3,).
+            here: pose of the found scan in the session's frame, (3,).
         """
         config = self.config
         shares = [self.cells.contradiction(compose2(moved, k.map_from_base), k.scan) for k in recent]

@@ -15,12 +15,12 @@ _STATUSES = {
     SlamStatus.TRACKED: (Level.OK, "Tracking"),
     SlamStatus.RECOVERED: (
         Level.WARN,
-        "Odometry was far off; the wide search has found the scan. Check tracks and encoders",
+        "Odometry was far off, but the wide search has found the scan. Check tracks and encoders",
     ),
     SlamStatus.LOST: (Level.ERROR, "The scan fits nowhere near; the pose follows odometry. Drive slowly"),
     SlamStatus.RESTARTED: (
         Level.ERROR,
-        "The robot is lost and maps apart from its map. Drive slowly until its place is recognized",
+        "The robot is lost and has started a separate map. Drive slowly until its place is recognized",
     ),
     SlamStatus.NO_POINTS: (Level.WARN, "The scan has too few points; the pose follows odometry. Uncover the LiDAR"),
     SlamStatus.TIME_BACKWARDS: (Level.WARN, "The scan is not newer than the last and is ignored"),
@@ -28,11 +28,11 @@ _STATUSES = {
 
 
 def diagnoses(slam: GridSlam, result: SlamResult, with_odometry: bool, use_wheel_odom: bool) -> Iterator[Diagnosis]:
-    """Yield the state of the SLAM after a scan.
+    """Yield the diagnoses of the SLAM after a scan.
 
     Args:
-        slam: after `GridSlam.process`.
-        result: result of that scan.
+        slam: the SLAM after `GridSlam.process`.
+        result: result of the scan.
         with_odometry: whether the scan came with odometry.
         use_wheel_odom: whether scans should come with odometry.
     """

@@ -12,10 +12,11 @@ FloatArray = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Scan:
-    """One scan, as in sensor_msgs/LaserScan, ranges by REP-117.
+    """One scan, as in sensor_msgs/LaserScan.
 
-    ``ranges`` is (n,) in metres: −inf too close, NaN erroneous, +inf no return within range. Beam ``i`` points to
-    ``angle_min + i·angle_increment`` radians in the laser's frame. All beams are treated as measured at ``stamp_ns``.
+    ``ranges`` is (n,) in metres. As in REP-117, −inf is too close, NaN an error and +inf no return. Beam ``i`` points
+    to ``angle_min + i·angle_increment`` radians in the laser's frame. All beams are treated as measured at
+    ``stamp_ns``.
     """
 
     ranges: NDArray[np.floating]
@@ -40,8 +41,8 @@ class ScanPoints:
 
     Attributes:
         points: hits in beam order, (n, 2).
-        joined: (n,) whether point ``i`` continues the surface of point ``i - 1``.
-        origin: the laser's centre, (2,).
+        joined: whether point ``i`` continues the surface of point ``i - 1``, (n,).
+        origin: centre of the laser, (2,).
     """
 
     points: FloatArray
@@ -50,7 +51,7 @@ class ScanPoints:
 
 
 JOIN_GAP_M = 0.3
-"""Neighbouring hits closer than this are one surface: less than the width of a door."""
+"""Largest distance between neighbouring hits of one surface, less than the width of a door."""
 POINT_SPACING_M = 0.04
 """Minimum spacing of the matched points along a surface, below the cell size of the field."""
 COLLINEAR_M = 0.05
@@ -59,10 +60,10 @@ COLLINEAR_GAP_RATIO = 2.0
 
 
 def _joined(points: FloatArray, beams: NDArray[np.intp]) -> NDArray[np.bool_]:
-    """Mark the points (n, 2) that continue the surface of the previous one.
+    """Return which points (n, 2) continue the surface of the previous point.
 
-    Points of neighbouring beams are joined if they are close together. On a wall seen at a grazing angle, where hits
-    lie metres apart, points are also joined if they are in line with the next hit on either side.
+    Points of neighbouring beams are joined if they are close together. Points on a wall at a grazing angle, where hits
+    are metres apart, are joined if they are in line with the next hit on either side.
     """
     joined = np.zeros(len(points), dtype=np.bool_)
     if len(points) < 2:
@@ -72,7 +73,7 @@ def _joined(points: FloatArray, beams: NDArray[np.intp]) -> NDArray[np.bool_]:
     neighbours = np.diff(beams) == 1
     in_line = np.zeros(len(step), dtype=np.bool_)
     if len(step) > 1:
-        # Distance of the far end of one step from the line of the adjacent step; shared by both steps.
+        # cross / shorter is the distance of the longer step's far end from the line of the shorter step.
         cross = np.abs(step[:-1, 0] * step[1:, 1] - step[:-1, 1] * step[1:, 0])
         forward = (step[:-1] * step[1:]).sum(axis=1) > 0
         straight = neighbours[:-1] & neighbours[1:] & forward
@@ -85,9 +86,9 @@ def _joined(points: FloatArray, beams: NDArray[np.intp]) -> NDArray[np.bool_]:
 
 
 def scan_points(scan: Scan, base_from_laser: FloatArray) -> ScanPoints:
-    """Return the hits of ``scan``; a range is a hit if ``range_min <= r <= range_max`` (REP-117).
+    """Return the hits of ``scan``. A range is a hit if ``range_min <= r <= range_max`` (REP-117).
 
-    Neighbouring beams whose hits lie no more than `JOIN_GAP_M` apart, or in a line, are one surface.
+    Hits of neighbouring beams are one surface if they are at most `JOIN_GAP_M` apart or in a line.
     """
     ranges = np.asarray(scan.ranges, dtype=np.float64)
     angles = scan.angle_min + scan.angle_increment * np.arange(ranges.size) + base_from_laser[2]
@@ -109,7 +110,7 @@ def thin(points: FloatArray, joined: NDArray[np.bool_], max_points: int) -> Floa
         return points
     step = np.zeros(len(points))
     step[1:] = np.where(joined[1:], np.sqrt(((points[1:] - points[:-1]) ** 2).sum(axis=1)), np.inf)
-    # Arc length along each surface; a point is kept where the length enters a new interval of POINT_SPACING_M.
+    # Keep a point where the arc length along its surface enters a new interval of POINT_SPACING_M.
     step[~np.isfinite(step)] = POINT_SPACING_M
     stretch = np.floor(np.cumsum(step) / POINT_SPACING_M)
     keep = np.ones(len(points), dtype=np.bool_)

@@ -1,4 +1,4 @@
-"""Scans that wait for the odometry of their stamps."""
+"""Queue of scans that wait for the odometry of their stamps."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ from instant_ic.util.diagnosis import Diagnosis, Level
 STARTUP_WAIT_S, EXTRAPOLATE_S = 1.0, 0.2
 """Longest time that the first scans wait for any odometry; longest extrapolation of the last motion."""
 TIME_JUMP_S = 1.0
-"""A larger jump back in time starts a new map (a bag played again)."""
+"""Jump back in time above which a new map starts, for example when a bag is played again."""
 SILENT_NS = 500_000_000
-"""Odometry is not waited for if its newest stamp is farther than this from the scan's."""
+"""Difference between the newest odometry's stamp and a scan's above which the scan does not wait."""
 
 
 class ScanError(ValueError):
-    """A scan cannot be used; the text says why."""
+    """A scan cannot be used."""
 
 
 @dataclass(frozen=True)
 class QueuedScan:
-    """A scan with its mount base_from_laser (3,) and the time of its arrival."""
+    """A scan with the laser's mount base_from_laser (3,) and the time of arrival."""
 
     scan: Scan
     base_from_laser: FloatArray
@@ -34,13 +34,13 @@ class QueuedScan:
 
 
 class ScanQueue:
-    """Keeps scans until the odometry of their stamps has arrived, or has been waited for long enough.
+    """Keeps scans until the odometry of their stamps has arrived or their waiting time is over.
 
     Attributes:
-        config: may be replaced at any time.
+        config: parameters, which may be replaced at any time.
         last_ns: stamp of the newest scan; None before the first.
         dropped: number of scans that could not be used.
-        state: whether scans arrive and can be used.
+        state: diagnosis of the arrival and use of scans.
     """
 
     def __init__(self, config: QueueConfig) -> None:
@@ -59,17 +59,17 @@ class ScanQueue:
         self._waiting.clear()
 
     def add_odometry(self, stamp_ns: int, odom_from_base: FloatArray) -> bool:
-        """Add odometry (3,). Return False if it is not finite, or not newer than the last."""
+        """Add odometry (3,), unless it is not finite or not newer than the last. Return whether it was added."""
         newest = self._wheel.newest_ns
         if newest is not None and newest - stamp_ns > TIME_JUMP_S * 1e9:
             self._wheel.clear()
         return self._wheel.add(stamp_ns, odom_from_base)
 
     def check_stamp(self, stamp_ns: int, now_ns: int) -> float:
-        """Return the seconds by which time went back at this scan: above 0, a new map must begin.
+        """Return by how many seconds time went back at this scan. If it is above 0, a new map must start.
 
         Raises:
-            ScanError: the scan is too old, in the future, or not newer than the last.
+            ScanError: the scan is too old, in the future or not newer than the last.
         """
         age_s = (now_ns - stamp_ns) * 1e-9
         if abs(age_s) > self.config.max_scan_age_s:
@@ -88,7 +88,7 @@ class ScanQueue:
         self.state = Diagnosis("scan", Level.WARN, reason, {"dropped": self.dropped})
 
     def watch(self, steady_ns: int) -> Diagnosis:
-        """Return the state at a steady time: an error once no scan has arrived for ``max_scan_age_s``."""
+        """Return the state at a steady time, which is an error if no scan has arrived for ``max_scan_age_s``."""
         age_s = (steady_ns - self._came_ns) * 1e-9
         if self.last_ns is not None and age_s > self.config.max_scan_age_s:
             return Diagnosis(
@@ -97,7 +97,7 @@ class ScanQueue:
         return self.state
 
     def add(self, scan: Scan, base_from_laser: FloatArray, now_ns: int, steady_ns: int) -> None:
-        """Add a scan with its mount (3,)."""
+        """Add a scan with the laser's mount (3,)."""
         self.last_ns, self._came_ns = scan.stamp_ns, steady_ns
         self.state = Diagnosis("scan", Level.OK, "Fresh", {"dropped": self.dropped})
         self._waiting.append(QueuedScan(scan, base_from_laser, now_ns))
@@ -108,7 +108,7 @@ class ScanQueue:
         return bool(self._waiting)
 
     def ready(self, now_ns: int) -> Iterator[tuple[QueuedScan, FloatArray | None]]:
-        """Yield the scans that need not wait longer, each with odom_from_base (3,), or None without odometry."""
+        """Yield the scans that need not wait any longer, each with odom_from_base (3,) or None."""
         while self._waiting:
             queued = self._waiting[0]
             odometry = None
@@ -128,12 +128,12 @@ class ScanQueue:
             self._first_wait_ns = self._first_wait_ns or queued.arrived_ns
             return now_ns - self._first_wait_ns < STARTUP_WAIT_S * 1e9
         if abs(queued.scan.stamp_ns - newest) >= SILENT_NS:
-            return False  # the wheels have long been silent, or the scan is older than the stored odometry
+            return False  # odometry has stopped, or the scan is older than all stored odometry
         return now_ns - queued.arrived_ns < self.config.odom_wait_s * 1e9
 
 
 def level_mount(base_from_laser: Matrix) -> FloatArray:
-    """Return the planar mount (3,) of a laser; raise ValueError if its scan plane is not level."""
+    """Return the planar mount (3,) of a laser. Raise ValueError if its scan plane is not level."""
     if base_from_laser[2, 2] < 0.9:
         raise ValueError("the laser's z axis is more than 25° off the vertical: check its mount (lidar_mount)")
     return pose2_from_matrix(base_from_laser)

@@ -1,4 +1,4 @@
-"""Start of the SLAM: with or without a saved map, and with its kernels compiled."""
+"""Creation of the SLAM with or without a saved map, and compilation of its kernels."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ def make_slam(config: SlamConfig | None = None, map_file: Path | None = None, lo
     """Create the SLAM, with a saved map if one is named.
 
     Args:
-        config: defaults when None.
-        map_file: a saved map, ``NAME`` or ``NAME.yaml``; None starts a new map.
-        localize: True keeps the map unchanged; False extends it, which needs its ``NAME.graph.npz``.
+        config: parameters; None uses the defaults.
+        map_file: saved map, ``NAME`` or ``NAME.yaml``; None starts a new map.
+        localize: keep the saved map unchanged. Otherwise it is extended, which needs ``NAME.graph.npz``.
 
     Raises:
         MapError: the map cannot be read.
@@ -38,9 +38,9 @@ def make_slam(config: SlamConfig | None = None, map_file: Path | None = None, lo
 
 
 def warm_up(config: SlamConfig | None = None) -> None:
-    """Compile the kernels, or load them from their cache, and import the solver.
+    """Compile the kernels or load them from their cache, and import the solver.
 
-    Otherwise they would delay the first scan, and the solver (60 MB) the scans of the first loop closure.
+    Otherwise, the kernels would delay the first scan, and the solver (60 MB) the scans at the first loop closure.
     """
     leave_out_blas()
     slam = GridSlam(config)
