@@ -84,16 +84,20 @@ def compose_yaml(text: str) -> yaml.Node | None:
     Raises:
         yaml.YAMLError: the text is not YAML, is nested too deeply, or its aliases expand to too many values.
     """
+    root = _checked(lambda: _composed(text))
+    if root is not None:
+        _measure(root, 0, {})
+    return root
+
+
+def _composed(text: str) -> yaml.Node | None:
     loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
     level = 0
     for event in yaml.parse(text, Loader=loader):  # compose() is recursive and could overflow the C stack
         level += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
         if level > _MOST_LEVELS:
             raise _refused(_TOO_DEEP, event)
-    root = _checked(lambda: yaml.compose(text, Loader=loader))
-    if root is not None:
-        _measure(root, 0, {})
-    return root
+    return yaml.compose(text, Loader=loader)
 
 
 def construct(node: yaml.Node) -> Any:

@@ -43,6 +43,12 @@ def test_an_anchor_that_contains_itself_is_refused(text: str) -> None:
         read_yaml(text)
 
 
+@pytest.mark.parametrize("text", ["\ud800", "a: \ud800"])  # as Python reads the argument $'\xff' of a command
+def test_text_that_is_no_unicode_is_refused(text: str) -> None:
+    with pytest.raises(yaml.YAMLError, match="surrogates"):
+        read_yaml(text)
+
+
 @pytest.mark.parametrize("levels", [101, 5000])
 def test_depth_is_limited(levels: int) -> None:
     assert read_yaml("[" * 100 + "]" * 100) == read_yaml("- " * 99 + "[]")
