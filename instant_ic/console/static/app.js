@@ -36,7 +36,7 @@ const images = new Images(viewer, link);
 const screen = new Screen(viewer, images, look, link, lease);
 const recording = new Recording(link);
 const wake = () => screen.wake();
-// A page whose view is lost (crash or update of the graphics driver) must not drive. The new page has a view, or only stops.
+// A page whose view is lost (crash or update of the graphics driver) must not drive. Reloaded, it has a view or only stops.
 canvas.addEventListener("webglcontextlost", () => {
   lease.mayDrive = false;
   lease.handOver();
@@ -53,7 +53,7 @@ function makeViewer() {
   }
 }
 
-/** Leaves only advice and the emergency stop on the page: a page that shows nothing must not drive. */
+/** Leaves only advice and the emergency stop on the page, because a page without a view must not drive. */
 function onlyStop() {
   const text = byId("no-view");
   byId("stick").remove();
@@ -133,7 +133,7 @@ function attachStop() {
   for (const name of /** @type {const} */ (["keydown", "keyup"])) {
     window.addEventListener(name, (event) => {
       if (event.code !== "Space") return;
-      // No focused button may receive the space bar.
+      // The space bar must not press a focused button.
       event.preventDefault();
       event.stopPropagation();
       if (name === "keydown" && !event.repeat) stopNow();
@@ -144,7 +144,7 @@ function attachStop() {
 function stopNow() {
   drive.stop();
   link.send({ type: "estop" });
-  // A second request takes its own connection, because the WebSocket may be stuck. A second stop changes nothing.
+  // The stop is also sent over a connection of its own, because the WebSocket may be stuck. A second stop does no harm.
   fetch("/estop", { method: "POST", keepalive: true }).then(({ ok }) => ok).catch(() => false).then((sent) => {
     if (!sent && !link.connected) hud.toast("Emergency stop not sent: no connection to the server.");
   });
@@ -155,7 +155,7 @@ function askForTheLease() {
   if (refusal) hud.toast(refusal);
 }
 
-/** Sets the speed limit. @param {number} percent of the largest one, 10 to 100 */
+/** Sets the speed limit. @param {number} percent of the largest speed, 10 to 100 */
 function setScale(percent) {
   const value = Math.min(Math.max(percent, 10), 100);
   scale.value = String(value);

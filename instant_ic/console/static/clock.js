@@ -1,5 +1,5 @@
 // @ts-check
-// Estimate of the server's clock and quality of the link, from the round trips of pings.
+// The server's clock and the quality of the link, estimated from the round trips of pings.
 
 const KEPT = 100;
 const QUALITY_SAMPLES = 60, LEAST_SAMPLES = 10;
@@ -12,21 +12,21 @@ export class ServerClock {
     this._offsetMs = null;
   }
 
-  /** Forgets all round trips: a new connection may lead to a restarted server. */
+  /** Forgets all round trips, because a new connection may lead to a restarted server. */
   reset() {
     this._samples = [];
     this._offsetMs = null;
   }
 
   /**
-   * Notes an answer that arrived at `nowMs` of this page's clock.
+   * Records an answer that arrived at `nowMs` of this page's clock.
    * @param {number} sentMs @param {number} serverMs @param {number} nowMs
    */
   take(sentMs, serverMs, nowMs) {
     const roundTrip = nowMs - sentMs;
     this._samples.push({ roundTrip, offset: serverMs + roundTrip / 2 - nowMs });
     if (this._samples.length > KEPT) this._samples.shift();
-    // The fastest answer was delayed least, so its offset is the most accurate.
+    // The fastest answer was delayed least, so that its offset is the most accurate.
     this._offsetMs = this._samples.reduce((a, b) => (b.roundTrip < a.roundTrip ? b : a)).offset;
   }
 
@@ -49,7 +49,7 @@ export class ServerClock {
     return usual <= 200 && slow <= 400 ? "fair" : "poor";
   }
 
-  /** Returns the newest round trips, ms, the shortest first. */
+  /** Returns the newest round trips in ms, the shortest first. */
   _sorted() {
     return this._samples.slice(-QUALITY_SAMPLES).map((sample) => sample.roundTrip).sort((a, b) => a - b);
   }

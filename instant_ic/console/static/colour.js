@@ -1,5 +1,5 @@
 // @ts-check
-// Colour matching of two images of one place by a gain for each channel: exposure and white balance change only gains.
+// Colour matching of two images of one place by a gain per channel. Exposure and white balance differ only by such gains.
 
 /** @import { Vec3 } from "./math.js" */
 import { clamp } from "./math.js";
@@ -7,13 +7,13 @@ import { clamp } from "./math.js";
 /** @type {Vec3} Gains that change nothing. */
 export const plain = [1, 1, 1];
 
-const LEAST_OVERLAP = 0.05; // share of the samples; with less, colours are not matched
-const DARKEST = 0.05, BRIGHTEST = 0.95; // the ratio of darker values is noise, brighter ones are clipped
+const LEAST_OVERLAP = 0.05; // smallest share of samples in both images with which colours are matched
+const DARKEST = 0.05, BRIGHTEST = 0.95; // darker values are too noisy for a ratio, brighter ones are clipped
 const MOST_GAIN = 1.8;
 
 /**
- * Returns the gains that make `from` look most like `to`. The median ratio ignores samples where something moved or an edge
- * is slightly off.
+ * Returns the gains that match the colours of `from` to those of `to`. As medians of ratios, they ignore the few samples
+ * where something has moved or an edge is displaced.
  * @param {number[]} from 3 values per sample, 0..1 @param {number[]} to @param {number[]} weights one per sample, 0..1
  * @returns {Vec3}
  */

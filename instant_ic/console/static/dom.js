@@ -1,7 +1,7 @@
 // @ts-check
 // Access to the page's elements.
 
-/** Element of index.html by its id; an error if it is missing. @param {string} id */
+/** Returns the element of index.html with this id; throws if it is missing. @param {string} id */
 export function byId(id) {
   const element = document.getElementById(id);
   if (!element) throw new Error(`index.html has no element #${id}`);
@@ -11,7 +11,7 @@ export function byId(id) {
 /** @template {Element} T @param {string} id @param {new () => T} type @returns {T} */
 export function elementOf(id, type) {
   const element = byId(id);
-  if (!(element instanceof type)) throw new Error(`#${id} of index.html is no ${type.name}`);
+  if (!(element instanceof type)) throw new Error(`#${id} of index.html is not a ${type.name}`);
   return element;
 }
 
@@ -25,18 +25,18 @@ export function context2d(canvas, options) {
   return context;
 }
 
-/** Sets an element's text if it has changed: screen readers would repeat it. @param {Element} element @param {string} text */
+/** Sets an element's text if it differs, so that screen readers do not repeat it. @param {Element} element @param {string} text */
 export function write(element, text) {
   if (element.textContent !== text) element.textContent = text;
 }
 
-/** Sets an attribute if it has changed: else the browser would render again. @param {string} id @param {string} name @param {string} value */
+/** Sets an attribute if it differs, so that the browser does not render again. @param {string} id @param {string} name @param {string} value */
 export function attribute(id, name, value) {
   const element = byId(id);
   if (element.getAttribute(name) !== value) element.setAttribute(name, value);
 }
 
-/** Sets a data attribute of the page, for styles and tests, if it has changed. @param {string} name @param {string} value */
+/** Sets a data attribute of the page, for styles and tests, if it differs. @param {string} name @param {string} value */
 export function mark(name, value) {
   if (document.body.dataset[name] !== value) document.body.dataset[name] = value;
 }

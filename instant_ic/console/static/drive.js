@@ -21,7 +21,7 @@ export function isDriveKey(event) {
 
 /**
  * The operator's drive command. Events: "change" when keys, stick or command may have changed; "stop" (detail: reason or "")
- * when anything but a released key or stick ends a drive.
+ * when a drive ends for another reason than a released key or stick.
  */
 export class Drive extends EventTarget {
   /** @param {Link} link */
@@ -124,7 +124,7 @@ export class Drive extends EventTarget {
   }
 }
 
-/** On-screen stick: `element` holds a child with class "knob". @param {HTMLElement} element @param {Drive} drive */
+/** Makes `element`, which has a child with class "knob", an on-screen stick. @param {HTMLElement} element @param {Drive} drive */
 export function attachStick(element, drive) {
   const knob = /** @type {HTMLElement} */ (element.querySelector(".knob"));
   /** @type {number | null} */
@@ -153,7 +153,7 @@ export function attachStick(element, drive) {
     drive.setStick(deadZone(-y / radius), deadZone(-x / radius));
   };
   element.addEventListener("pointerdown", (event) => {
-    if (pointer !== null || !drive.enabled) return; // a touch that began without the lease never drives
+    if (pointer !== null || !drive.enabled) return; // a touch that begins without the lease never drives
     pointer = event.pointerId;
     element.setPointerCapture(event.pointerId);
     event.preventDefault();
@@ -167,7 +167,7 @@ export function attachStick(element, drive) {
   });
 }
 
-/** Axis of a stick, [-1, 1], with a dead zone around its centre. @param {number} value */
+/** Returns the value of a stick's axis, [-1, 1], with a dead zone around its centre. @param {number} value */
 export function deadZone(value) {
   const size = Math.abs(value);
   return size < 0.12 ? 0 : (Math.sign(value) * (size - 0.12)) / 0.88;

@@ -21,7 +21,7 @@ const STEP = 10; // percent of the speed limit
  * @property {() => void} wake the direction changed
  */
 
-/** The gamepad drives only while the window has focus, with a shoulder button pressed after it gained focus. */
+/** The gamepads. One drives only while the window has focus, and with a shoulder button pressed after it gained focus. */
 export class Gamepads {
   /** @param {Drive} drive @param {Look} look @param {PadActions} actions */
   constructor(drive, look, actions) {
@@ -38,7 +38,7 @@ export class Gamepads {
     window.addEventListener("gamepaddisconnected", ({ gamepad }) => {
       if (gamepad.index === this._index) this._lose();
     });
-    // Any stop also stops the pad: the button must be released and pressed again.
+    // After any stop, the shoulder button must be released and pressed again.
     drive.addEventListener("stop", () => { this._driving = false; });
   }
 
@@ -52,7 +52,7 @@ export class Gamepads {
     this._index = pad.index;
     this._last = performance.now();
     this._timer = setInterval(() => this._poll(), POLL_MS);
-    this._held = pressed(pad); // a button held already was not pressed for driving
+    this._held = pressed(pad); // a button that is already held was not pressed to drive
     mark("pad", "ready");
     this.actions.notice("Gamepad connected: hold a shoulder button and drive with the left stick.");
   }
@@ -73,7 +73,7 @@ export class Gamepads {
     const held = pressed(pad), fresh = [...held].filter((button) => !this._held.has(button));
     this._held = held;
     const focused = document.hasFocus() && !document.hidden;
-    if (fresh.includes(STOP)) this.actions.stop(); // also without focus
+    if (fresh.includes(STOP)) this.actions.stop(); // even without focus
     if (!focused) return this._release();
     if (!this.drive.enabled) this._release(); // not the driver, or an emergency stop
     if (fresh.includes(FASTER)) this.actions.changeScale(STEP);

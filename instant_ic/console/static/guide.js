@@ -6,7 +6,7 @@ import { attribute, byId } from "./dom.js";
 import { degrees, rotate, wrapAngle } from "./math.js";
 
 const NEAREST_M = 0.25;
-const REACH_M = 4; // the trajectory is extended to here, because the nearby floor is out of view
+const REACH_M = 4; // the trajectory is extended to this length, because the nearby floor is out of view
 const STEP_M = 0.1;
 const COMPASS_PIXELS = 1.6; // per degree, as in style.css
 
@@ -36,7 +36,7 @@ export function extended(points) {
 }
 
 /**
- * Shows the predicted trajectory as a ribbon on the floor, seen by the shown camera.
+ * Shows the predicted trajectory as a ribbon on the floor, as the shown camera would see it.
  * @param {[number, number][]} trajectory points in the map frame, m @param {{lookFromMap: Mat3, position: Vec3}} camera
  * @param {[number, number]} tanHalf of the shown field of view @param {number} halfWidth m
  */
@@ -48,13 +48,13 @@ export function showGuide(trajectory, camera, tanHalf, halfWidth) {
   attribute("guide-fade", "y2", String(Math.min(innerHeight, ...ends.map(([, y]) => y))));
 }
 
-/** Turns the tape of directions, of which 0 is straight ahead of the robot. @param {number} lookYaw */
+/** Turns the tape of directions to `lookYaw`; 0 is straight ahead of the robot. @param {number} lookYaw */
 export function showCompass(lookYaw) {
   byId("compass-tape").style.translate = `${(degrees(lookYaw) * COMPASS_PIXELS).toFixed(1)}px`;
 }
 
 /**
- * Returns both rails of the ribbon in the window, pixels; empty out of view.
+ * Returns both rails of the ribbon in pixels of the window; empty if out of view.
  * @param {[number, number][]} trajectory @param {{lookFromMap: Mat3, position: Vec3}} camera
  * @param {[number, number]} tanHalf @param {number} halfWidth
  */

@@ -1,5 +1,5 @@
 // @ts-check
-// The overlay: mode, link, faults, gauges, banner. Text only, never HTML from the robot.
+// The overlay: mode, link, faults, gauges, banner. Texts of the robot are never used as HTML.
 
 /** @import { Drive } from "./drive.js" */
 /** @import { Images } from "./images.js" */
@@ -109,7 +109,7 @@ export function showLease({ driver, clients, door }) {
 /** @param {Link} link @param {Lease} lease @param {State | null} state */
 export function showBanner(link, lease, state) {
   const lost = !link.connected && link.everConnected, estop = lease.estop || (state?.estop ?? false);
-  // A stopped robot starts only once the controls are released, so remind an operator who still holds a key.
+  // A stopped robot starts only after the controls have been released, so remind an operator who still holds a key.
   const held = state?.mode === "stopped" && (state.command ?? []).some((value) => value !== 0);
   mark("link", link.connected ? "up" : lost ? "lost" : "connecting");
   mark("estop", estop ? "set" : "free");
@@ -123,7 +123,7 @@ export function showBanner(link, lease, state) {
 
 let announceTimer = 0;
 /**
- * Announces a text to screen readers after ANNOUNCE_MS, unless another one replaces it: short changes stay silent.
+ * Announces a text to screen readers after ANNOUNCE_MS unless another one replaces it, so that short changes stay silent.
  * @param {string} text
  */
 export function announce(text) {
@@ -141,7 +141,7 @@ export function toast(text) {
   toastTimer = setTimeout(() => element.classList.remove("shown"), TOAST_MS);
 }
 
-/** Calls `done` when `button` was held by pointer or Enter for 0.8 s. @param {HTMLElement} button @param {() => void} done */
+/** Calls `done` after `button` was held by pointer or Enter for 0.8 s. @param {HTMLElement} button @param {() => void} done */
 export function holdToConfirm(button, done) {
   let timer = 0;
   const start = () => {

@@ -23,21 +23,21 @@ import { Prediction } from "./prediction.js";
  * @property {Mat3} panoramaFromLook
  * @property {Mat3} viewFromLook
  * @property {[number, number]} viewTanHalf of the rendered view
- * @property {Glide | null} glide the camera's image from another place; null: as it was taken
- * @property {Vec3 | null} place from which the layers are shown instead of the rendered view, m; null: there are none
+ * @property {Glide | null} glide shows the camera's image from another place; null: it is shown as it was taken
+ * @property {Vec3 | null} place from which the layers are shown instead of the rendered view, m; null: no layers
  * @property {number} blend 0 panorama, 1 view
  * @property {Vec3} panoramaGain of the colours
  * @property {Vec3} viewGain
  */
 
 const STALE_MS = 2000;
-const KEPT_TIMES = 100; // of images, for their rate
-// Longest wait for an image made after the change of mode; afterwards the best available is shown.
+const KEPT_TIMES = 100; // number of arrival times kept per kind of image, for its rate
+// Longest wait for an image made after a change of mode. After it, the best available image is shown.
 const WAIT_MS = { [PANORAMA]: 300, [VIEW]: 500 };
 const LAYERS_MS = 5000; // longest wait for the layers of a new link
-// A camera image taken farther away, or older, is shown as it was taken.
+// A camera image that was taken farther away or longer ago is shown as it was taken.
 const ELSEWHERE_M = 0.5, FROZEN_MS = 1000;
-const LEAD_MS = 800; // after a switch, the prediction takes this long to include the full delay of a command
+const LEAD_MS = 800; // time after a switch until the prediction includes the full delay of a command
 
 export class Images {
   /** @param {GlViewer} viewer @param {Link} link */
@@ -53,7 +53,7 @@ export class Images {
     this.changed = true;
     this.motion = new Motion();
     this.prediction = new Prediction();
-    /** @type {LayersHeader | null} The layers that this page renders by itself; null: it shows rendered views. */
+    /** @type {LayersHeader | null} The layers that this page renders itself; null: it shows views rendered by the server. */
     this.layers = null;
     /** @type {Map<string, Surface>} Loaded surfaces, by id. */
     this._held = new Map();
@@ -62,8 +62,8 @@ export class Images {
     this.cameraMs = null;
     /** @type {PanoramaHeader | null} The camera image of the last rendered frame. */
     this._rendered = null;
-    this.shownMs = 0; // time of the newest state that is shown, server's clock
-    this.moves = false; // the v-bot moves, as far as this page knows
+    this.shownMs = 0; // time of the newest shown state, server's clock
+    this.moves = false; // by this page's prediction, the v-bot moves
     this.glides = !viewer.slow; // the camera's image is shown from the robot's present place
     /** @type {[number, number] | null} Position in the map frame from which the view is shown. */
     this.place = null;
@@ -73,7 +73,7 @@ export class Images {
     this._followed = null;
     this._lead = 0; // share of a command's delay that is predicted
     this._virtual = false;
-    // Time from which on images of each kind are taken at the shown robot, server's clock; Infinity: they are not.
+    // Server time since which images of each kind are taken at the shown robot; Infinity: they are taken elsewhere.
     this._since = { [PANORAMA]: Infinity, [VIEW]: Infinity };
     this._changedAt = 0;
     this._toward = 0;
@@ -83,12 +83,12 @@ export class Images {
     this.configure(DEFAULT_PAGE);
   }
 
-  /** @param {PageSettings} settings @param {boolean} still the operator's system asks for little motion */
+  /** @param {PageSettings} settings @param {boolean} still the operator's system asks for reduced motion */
   configure({ dissolve_ms, ease_ms, max_accel, colour_release_s }, still = false) {
     this.dissolveMs = still ? 0 : dissolve_ms;
     this.motion.easeMs = still ? 0 : ease_ms;
     this.prediction.maxAccel = max_accel;
-    for (const gains of Object.values(this._gains)) gains.releaseMs = 1000 * colour_release_s; // 0: no matching
+    for (const gains of Object.values(this._gains)) gains.releaseMs = 1000 * colour_release_s; // 0: colours are not matched
   }
 
   /** Decodes an image, passes it to the viewer, then acknowledges it. @param {FrameOf<1> | FrameOf<2>} frame */
@@ -125,12 +125,12 @@ export class Images {
         this.changed = loaded = true;
       }
     } catch (error) {
-      console.warn(`layers of version ${frame.header.version}: ${error}; the ones before stay`);
+      console.warn(`layers of version ${frame.header.version}: ${error}; the previous layers stay`);
     }
     if (load === this._loads) this.link.acknowledge(frame, loaded);
   }
 
-  /** Waits for the layers of a new link. If none come, the page returns to rendered views. */
+  /** Waits for the layers of a new link. If none arrive, the page returns to views rendered by the server. */
   expectLayers() {
     const load = ++this._loads, { layers } = this;
     setTimeout(() => {
@@ -144,27 +144,27 @@ export class Images {
   /** @param {LayerData} data @returns {Promise<Layer>} */
   async _decodedLayer({ id, gain, q, p, mesh }) {
     const surface = mesh ? await decodedSurface(mesh) : this._held.get(id);
-    if (!surface) throw new Error(`layer ${id} is not here`);
+    if (!surface) throw new Error(`the mesh of layer ${id} has not been loaded`);
     return { surface, gain, mapFromCamera: fromQuaternion(q), position: p };
   }
 
-  /** True if the layers take the place of rendered views. */
+  /** True if this page renders layers in place of the server's views. */
   get rendersLayers() {
     return this.layers !== null && !this.viewer.lost;
   }
 
-  /** Counts a received image, or a view that this page rendered by itself. @param {Kind} kind */
+  /** Counts a received image, or a view rendered by this page. @param {Kind} kind */
   countFrame(kind) {
     this._times[kind] = [...this._times[kind].slice(1 - KEPT_TIMES), performance.now()];
   }
 
-  /** Images of a kind per second, over the last 3 s. @param {Kind} kind */
+  /** Returns the images of a kind per second, over the last 3 s. @param {Kind} kind */
   rate(kind) {
     const now = performance.now(), recent = this._times[kind].filter((t) => now - t < 3000);
     return recent.length < 2 ? 0 : (1000 * (recent.length - 1)) / (now - recent[0]);
   }
 
-  /** Notes that a frame with the newest images was rendered. */
+  /** Records that a frame with the newest images was rendered. */
   noteRendered() {
     const { panorama } = this, now = this.link.serverNow();
     if (!panorama || panorama === this._rendered || this.blend === 1 || now === null) return;
@@ -178,7 +178,7 @@ export class Images {
     return this.blend > 0.5 ? this.view : this.panorama;
   }
 
-  /** Age of the shown image, ms; null if there is none. */
+  /** Returns the age of the shown image in ms; null if there is none. */
   ageMs() {
     const now = this.link.serverNow();
     return this.shown && now !== null ? now - this.shown.captured_ms : null;
@@ -229,8 +229,8 @@ export class Images {
   }
 
   /**
-   * Returns the robot's present place, from which the camera's image is shown by the depth of the layers, so that a low frame
-   * rate looks smooth. Null: the image is shown as it was taken, so that an old one does not look new.
+   * Returns the robot's present place. The camera's image is shown from there with the depth of the layers, so that motion
+   * looks smooth at a low frame rate. Null if the image must be shown as it was taken, so that an old one does not look new.
    * @param {State | null} state @returns {Glide | null}
    */
   _glided(state) {
@@ -243,8 +243,8 @@ export class Images {
   }
 
   /**
-   * Returns the place from which the layers are shown; null if it is unknown. A gliding camera image is shown from it too.
-   * When the real robot is shown again, the place moves on with it, so that both images of the dissolve move alike.
+   * Returns the place from which the layers, and a gliding camera image, are shown; null if unknown. When the real robot is
+   * shown again, the place moves on with the robot, so that both images of the dissolve move alike.
    * @param {LayersHeader} layers @param {Glide | null} glide @returns {Vec3 | null}
    */
   _layersPlace({ mount }, glide) {
@@ -269,12 +269,12 @@ export class Images {
     const virtual = shows(state) === "virtual", at = state?.at_ms ?? 0;
     if (virtual !== this._virtual) this._changedAt = at;
     this._virtual = virtual;
-    // In ENTERING, views are already rendered at the v-bot's pose. In RETURNING, the camera is already there, and the
-    // switch comes when its newest image shows the same place as the view.
+    // In ENTERING, views are already rendered at the v-bot's pose. In RETURNING, the camera has already reached the v-bot,
+    // and the page switches when the newest image shows the same place as the view.
     const nearVbot = virtual || state?.mode === "entering", nearRobot = !virtual || state?.mode === "returning";
     this._since[VIEW] = nearVbot ? Math.min(this._since[VIEW], at) : Infinity;
     this._since[PANORAMA] = nearRobot ? Math.min(this._since[PANORAMA], at) : Infinity;
-    // A stop or a lost controller shows the camera's image, however old.
+    // After a stop or the loss of the controller, the camera's image is shown even if it is old.
     const waits = virtual || state?.mode === "real";
     const kind = virtual ? VIEW : PANORAMA, wanted = virtual ? 1 : 0;
     const toward = this.blend === wanted || this._toward === wanted || !waits || this._fits(kind) ? wanted : 1 - wanted;
@@ -288,7 +288,7 @@ export class Images {
     return starts;
   }
 
-  /** Returns whether the newest image of a kind may be shown: made since the switch, or the wait is over. @param {Kind} kind */
+  /** Returns whether a kind's newest image was made since the switch, or the wait for one is over. @param {Kind} kind */
   _fits(kind) {
     if (kind === VIEW && this.rendersLayers) return true;
     const header = kind === VIEW ? this.view : this.panorama;
@@ -305,7 +305,7 @@ export class Images {
     this._gains[comes].set(times(fitGains(seen[comes], seen[goes], seen.weights), this._gains[goes].at(now)), now);
   }
 
-  /** Updates the pose of the shown robot between the state messages. @param {State | null} state @param {number} elapsedMs */
+  /** Updates the pose of the shown robot between state messages. @param {State | null} state @param {number} elapsedMs */
   _follow(state, elapsedMs) {
     const robot = shows(state), pose = robot === "virtual" ? (state?.vbot ?? state?.robot) : state?.robot;
     const now = this.link.serverNow() ?? state?.at_ms ?? 0, age = state ? now - state.at_ms : 0;

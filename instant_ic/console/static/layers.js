@@ -1,6 +1,6 @@
 // @ts-check
-// Renderer in WebGL 2. It renders layers, which are triangles around a keyframe (Python: vspace/layers.py), from any place,
-// with their own colours or with the camera's image. It also renders the camera's image as it was taken, without depth.
+// Renderer in WebGL 2 for layers, the triangles around a keyframe (Python: vspace/layers.py). It renders them from any place,
+// in their own colours or with the camera's image on them. It also renders the camera's image as taken, without depth.
 
 /** @import { Mat3, Vec3 } from "./math.js" */
 /** @import { Mesh } from "./messages.js" */
@@ -24,7 +24,7 @@ import { createTexture, Program, setImage } from "./program.js";
  * @property {[number, number]} tanHalf tangents of half the field of view
  */
 /**
- * The camera's image in the place of the layers' own colours.
+ * A camera image that replaces the layers' own colours.
  * @typedef {object} Photo
  * @property {WebGLTexture} image equirectangular
  * @property {Mat3} mapFromCamera rotation of the camera
@@ -34,9 +34,9 @@ import { createTexture, Program, setImage } from "./program.js";
 
 const NEAR_M = 0.02;
 const WHITE = [255, 255, 255];
-const BEYOND_LEVEL = 4; // mipmap level where no layer has a surface
+const BEYOND_LEVEL = 4; // mipmap level shown where no layer has a surface
 
-// Homogeneous coordinates are divided by the vertex's distance, so that infinitely far vertices need no large numbers.
+// Homogeneous coordinates are divided by the vertex's distance, so that vertices at infinity have finite coordinates.
 const VERTEX = `
 in vec2 corner;
 in float inverse;
@@ -44,7 +44,7 @@ uniform vec2 size;
 uniform mat3 lookFromPanorama, imageFromPanorama;
 uniform vec3 position, imagePosition; // of the view and of the image's camera, in the keyframe's frame
 uniform vec2 tanHalf;
-out vec3 direction; // in the image's frame; its length varies as the interpolation needs it
+out vec3 direction; // in the image's frame; not a unit vector, so that it interpolates correctly
 void main() {
   float azimuth = ${Math.PI} * (1.0 - 2.0 * corner.x / size.y), elevation = ${Math.PI} * (0.5 - corner.y / size.x);
   vec3 ray = vec3(cos(elevation) * vec2(cos(azimuth), sin(azimuth)), sin(elevation));
@@ -57,8 +57,8 @@ const ANGLES = `
 const vec3 GREY = vec3(0.30, 0.59, 0.11);
 const float PI = ${Math.PI};
 
-// Azimuth and angle from the zenith. On the CPU, atan and acos take a seventh of an image's time; the polynomials
-// (Abramowitz and Stegun, 4.4.45 and 4.4.49) are exact to 7e-5 rad, a fiftieth of a pixel.
+// Azimuth and angle from the zenith. On the CPU, atan and acos would take a seventh of the rendering time. These
+// polynomials (Abramowitz and Stegun, 4.4.45 and 4.4.49) are exact to 7e-5 rad, a fiftieth of a pixel.
 vec2 angles(vec3 d) {
   if (SHARP) return vec2(atan(d.y, d.x), acos(clamp(d.z, -1.0, 1.0)));
   vec2 a = abs(d.xy);
@@ -81,7 +81,7 @@ void main() {
   vec2 angle = angles(normalize(direction)), uv = vec2(0.5 - angle.x / (2.0 * PI), angle.y / PI);
   if (SHARP) {
     vec2 across = dFdx(uv), down = dFdy(uv);
-    across.x -= round(across.x); // over the seam at the back
+    across.x -= round(across.x); // across the seam at the back
     down.x -= round(down.x);
     colour = vec4(textureGrad(image, uv, across * SHARPNESS, down * SHARPNESS).rgb, 1.0);
   } else colour = vec4(textureLod(image, uv, 0.0).rgb, 1.0);
@@ -96,7 +96,7 @@ void main() {
   colour.rgb *= gain;
 }`;
 
-// Panorama by direction alone: an image as it was taken, or the blurred colours where no layer has a surface.
+// A panorama by direction only: a camera image as taken, or blurred colours where no layer has a surface.
 const FAR = `
 in vec2 screen;
 out vec4 colour;
@@ -111,7 +111,7 @@ void main() {
   colour = vec4(mix(rgb, vec3(0.023, 0.028, 0.036) + 0.35 * dot(rgb, GREY), dim), 0.0);
 }`;
 
-/** Renders into the bound framebuffer, which needs depth and stencil. */
+/** A renderer into the bound framebuffer, which needs depth and stencil. */
 export class LayerRenderer {
   /** @param {WebGL2RenderingContext} gl @param {boolean} slow software rendering: plain look-ups */
   constructor(gl, slow) {
@@ -119,14 +119,14 @@ export class LayerRenderer {
     const sharp = `precision highp float;\nconst bool SHARP = ${!slow};\nconst float SHARPNESS = 0.7;\n${ANGLES}`;
     this._program = new Program(gl, sharp + FRAGMENT, VERTEX);
     this._far = new Program(gl, sharp + FAR);
-    this._minification = slow ? gl.LINEAR_MIPMAP_NEAREST : gl.LINEAR_MIPMAP_LINEAR; // the CPU would read two levels
+    this._minification = slow ? gl.LINEAR_MIPMAP_NEAREST : gl.LINEAR_MIPMAP_LINEAR; // one level is faster on the CPU
     this._anisotropy = slow ? null : gl.getExtension("EXT_texture_filter_anisotropic");
-    /** @type {(Loaded & {layer: Layer})[]} Each is shown where the ones before show nothing. */
+    /** @type {(Loaded & {layer: Layer})[]} Each layer is shown where the layers before it show nothing. */
     this._layers = [];
     this._seen = createTexture(gl, WHITE); // confidence of a surface that was seen completely
   }
 
-  /** Replaces the layers; loaded surfaces stay. @param {Layer[]} layers */
+  /** Replaces the layers. Surfaces that are still used stay loaded. @param {Layer[]} layers */
   load(layers) {
     /** @type {Map<Surface, Loaded>} */
     const before = new Map(this._layers.map((loaded) => [loaded.surface, loaded]));
@@ -140,11 +140,11 @@ export class LayerRenderer {
   }
 
   /**
-   * Renders the layers; alpha is 1 where the place was seen.
+   * Renders the layers; alpha is 1 where a keyframe has seen the surface.
    * @param {Camera} camera @param {number} width @param {number} height
    * @param {Vec3} tint gains of the colours
-   * @param {Photo | null} photo takes the place of the layers' own colours; only the depth of estimated surfaces counts then
-   * @param {boolean} mixed blending is on: each pixel is written once, the nearest surface found before
+   * @param {Photo | null} photo replaces the layers' own colours; of estimated surfaces, only the depth counts then
+   * @param {boolean} mixed blending is on: the nearest surface is found first, then each pixel is written once
    */
   render(camera, width, height, tint, photo = null, mixed = false) {
     const gl = this._gl;
@@ -154,7 +154,8 @@ export class LayerRenderer {
     gl.depthFunc(gl.LESS);
     gl.stencilMask(0xff);
     gl.clear(gl.STENCIL_BUFFER_BIT);
-    // Stencil bit k: layer k shows a surface here. A surface seen from behind hides, but shows the layers below.
+    // Stencil bit k: layer k shows a surface here. A surface seen from behind hides what is behind it, but lets the pixel
+    // show the layers below.
     this._layers.forEach(({ vertices, count, image, confidence, surface, layer }, k) => {
       const panoramaFromMap = transpose(layer.mapFromCamera), source = photo ?? layer;
       /** @param {Vec3} place in the map frame @returns {Vec3} in the keyframe's frame */

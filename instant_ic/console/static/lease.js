@@ -27,14 +27,14 @@ export class Lease extends EventTarget {
     link.addEventListener("lost", () => { this.driver = "none"; });
   }
 
-  /** True if the drive commands of this page count. */
+  /** True if this page's drive commands are obeyed. */
   get drives() {
     return this.driver === "you" && !this.estop;
   }
 
   /** @param {Session} session */
   take(session) {
-    // The lease timed out and was not given back: request it again. Keys must be pressed again.
+    // The lease has timed out and was not given back, so request it again. Keys must then be pressed again.
     if (this.driver === "you" && session.driver === "none" && !this._handedOver) this._request(false);
     this.driver = session.driver;
     this.door = session.door ?? "";
@@ -50,7 +50,7 @@ export class Lease extends EventTarget {
     return this.driver === "other" ? this.refusal : "";
   }
 
-  /** Text for an operator who cannot drive because another one does, with what to do. */
+  /** Text for an operator who cannot drive because another one does, and what to do. */
   get refusal() {
     return this.door ? ELSEWHERE : OTHER_DRIVES;
   }

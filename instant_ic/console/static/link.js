@@ -1,12 +1,12 @@
 // @ts-check
-// The WebSocket: reconnects, keeps the server's clock, and passes on checked messages and frames.
+// The WebSocket to the server: it reconnects, keeps the server's clock, and passes on checked messages and frames.
 
 /** @import { Frame, PartFrame, Pong } from "./messages.js" */
 import { ServerClock } from "./clock.js";
 import { decodeFrame, frameNumber, MessageError, PART, parseMessage } from "./messages.js";
 
 const PING_MS = 50; // the server counts a driver as lost after beat_timeout_s (0.25 s)
-const SILENCE_MS = 1000; // the link counts as lost after this silence
+const SILENCE_MS = 1000; // silence after which the link counts as lost
 const FIRST_RETRY_MS = 250, LAST_RETRY_MS = 2000;
 
 /**
@@ -28,11 +28,11 @@ export class Link extends EventTarget {
     this._socket = null;
     this._retryMs = FIRST_RETRY_MS;
     this._heard = 0;
-    this._pieces = new Blob(); // of a frame that comes in pieces
+    this._pieces = new Blob(); // pieces of a frame that have arrived so far
     this._sequence = 0;
     this._connect();
     setInterval(() => this._beat(), PING_MS);
-    // Sent at once, because timers of hidden pages run once a second or not at all.
+    // The ping is sent at once, because timers of hidden pages run once a second or not at all.
     document.addEventListener("visibilitychange", () => this._ping());
     window.addEventListener("pagehide", () => this._ping(true));
   }
@@ -88,13 +88,13 @@ export class Link extends EventTarget {
     this._retryMs = Math.min(this._retryMs * 2, LAST_RETRY_MS);
   }
 
-  /** Asks why the WebSocket was refused by an ordinary request, because a WebSocket gives no reason. */
+  /** Finds out by an ordinary request why the WebSocket was refused, because a WebSocket gives no reason. */
   async _askWhy() {
     try {
       const answer = await fetch("/health", { cache: "no-store" });
       if (answer.status === 401) this.dispatchEvent(new Event("signed-out"));
     } catch {
-      // No server; the next attempt will show.
+      // The server cannot be reached. The next attempt asks again.
     }
   }
 
@@ -107,7 +107,7 @@ export class Link extends EventTarget {
   _beat() {
     if (this._socket?.readyState !== WebSocket.OPEN) return;
     if (performance.now() - this._heard > SILENCE_MS && !document.hidden) {
-      // A dead path leaves the socket open for minutes, so close it here.
+      // On a dead network path the socket would stay open for minutes, so close it here.
       const dead = this._socket;
       this._socket = null;
       dead.close();
@@ -142,7 +142,7 @@ export class Link extends EventTarget {
     }
   }
 
-  /** Takes a piece of a frame; the frame is complete once the pieces have its size. @param {PartFrame} part */
+  /** Adds a piece of a frame. The frame is complete once the pieces have its size. @param {PartFrame} part */
   _collect(part) {
     const { header: { start, size }, payload } = part, socket = this._socket;
     this.acknowledge(part);

@@ -47,17 +47,17 @@ export class Look {
     window.addEventListener("blur", () => this._held.clear());
   }
 
-  /** True if keys or centring turn it. */
+  /** True while keys or centring turn the line of sight. */
   get moves() {
     return this._held.size > 0 || this._centring !== null;
   }
 
-  /** Turns to straight ahead. */
+  /** Starts to turn the line of sight straight ahead. */
   centre() {
     this._centring = { yaw: this.yaw, pitch: this.pitch, start: performance.now() };
   }
 
-  /** Turns by angles in radians, left and up. @param {number} yaw @param {number} pitch */
+  /** Turns the line of sight by angles in radians, left and up. @param {number} yaw @param {number} pitch */
   turn(yaw, pitch) {
     this._centring = null;
     this.yaw = wrapAngle(this.yaw + yaw);
@@ -69,7 +69,7 @@ export class Look {
     this.vfov = clamp(this.vfov * factor, MIN_VFOV, MAX_VFOV);
   }
 
-  /** Advances the motion of keys and centring. @param {number} seconds */
+  /** Advances the motion by keys and centring. @param {number} seconds */
   step(seconds) {
     for (const code of this._held) {
       this.turn(KEYS[code][0] * KEY_RATE * seconds, KEYS[code][1] * KEY_RATE * seconds);

@@ -12,7 +12,7 @@ export function rotationZ(angle) {
   return [c, -s, 0, s, c, 0, 0, 0, 1];
 }
 
-/** Rotation of the line of sight: left by `yaw`, up by `pitch`. @param {number} yaw @param {number} pitch */
+/** Returns the rotation of the line of sight to the left by `yaw` and up by `pitch`. @param {number} yaw @param {number} pitch */
 export function lookRotation(yaw, pitch) {
   const c = Math.cos(pitch), s = Math.sin(pitch);
   return multiply(rotationZ(yaw), [c, 0, -s, 0, 1, 0, s, 0, c]);
@@ -53,7 +53,7 @@ export function mounted([x, y, yaw], [ahead, left]) {
 /** @param {Vec3} a @param {Vec3} b @returns {Vec3} */
 export const times = (a, b) => [a[0] * b[0], a[1] * b[1], a[2] * b[2]];
 
-/** Rotation matrix of a quaternion. @param {[number, number, number, number]} q x, y, z, w @returns {Mat3} */
+/** Returns the rotation matrix of a quaternion. @param {[number, number, number, number]} q x, y, z, w @returns {Mat3} */
 export function fromQuaternion([x, y, z, w]) {
   return [
     1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w),
@@ -62,7 +62,7 @@ export function fromQuaternion([x, y, z, w]) {
   ];
 }
 
-/** Returns the same angle in [-π, π]. @param {number} angle */
+/** Returns the angle wrapped to [-π, π]. @param {number} angle */
 export function wrapAngle(angle) {
   return angle - 2 * Math.PI * Math.round(angle / (2 * Math.PI));
 }

@@ -1,5 +1,5 @@
 // @ts-check
-// Messages of the server, checked where they arrive.
+// Messages of the server, checked on arrival.
 
 /** @template T @typedef {(value: unknown, name: string) => T} Reader */
 
@@ -25,7 +25,7 @@ const flag = (value, name) => (typeof value === "boolean" ? value : refuse(name,
 const oneOf = (...values) => (value, name) =>
   values.find((known) => known === value) ?? refuse(name, `one of ${values.join(", ")}`, value);
 
-/** A field that may be missing or null. @template T @param {Reader<T>} read @param {NoInfer<T>} instead @returns {Reader<T>} */
+/** Reads a field that may be missing or null. @template T @param {Reader<T>} read @param {NoInfer<T>} instead @returns {Reader<T>} */
 const defaulted = (read, instead) => (value, name) => (value === null || value === undefined ? instead : read(value, name));
 
 /** @template T @param {Reader<T>} read @returns {Reader<T | null>} */
@@ -49,7 +49,7 @@ const triple = (value, name) => /** @type {[number, number, number]} */ (numbers
 const quaternion = (value, name) => /** @type {[number, number, number, number]} */ (numbers(value, name, 4));
 
 /**
- * Reads an object; fields that are not listed are dropped.
+ * Reads an object. Fields that are not listed are dropped.
  * @template {Record<string, Reader<unknown>>} F
  * @param {F} fields
  * @returns {Reader<{[K in keyof F]: ReturnType<F[K]>}>}
@@ -186,13 +186,13 @@ const layersHeader = object({
 });
 
 /**
- * A layer: triangles around the keyframe, whose vertices are corners of the panorama's pixels.
+ * A layer: triangles around a keyframe, whose vertices are corners of the panorama's pixels.
  * @typedef {object} LayerData
- * @property {string} id of the mesh: equal for equal content
+ * @property {string} id of the mesh; equal ids have equal content
  * @property {[number, number, number]} gain factors of the colours
  * @property {[number, number, number, number]} q rotation map_from_camera of the keyframe
- * @property {[number, number, number]} p its position in the map frame, m
- * @property {Mesh | null} mesh null: the mesh of this id in the layers before
+ * @property {[number, number, number]} p position of the keyframe in the map frame, m
+ * @property {Mesh | null} mesh null: the mesh of this id in earlier layers
  */
 /**
  * @typedef {object} Mesh
@@ -201,7 +201,7 @@ const layersHeader = object({
  * @property {Float32Array} inverse inverse depth of each vertex, 1/m
  * @property {Uint32Array} triangles indices of vertices
  * @property {Blob} image JPEG or PNG, equirectangular
- * @property {Blob | null} confidence PNG; null: all of it was seen
+ * @property {Blob | null} confidence PNG; null: a keyframe has seen all of the mesh
  */
 /** @typedef {Omit<ReturnType<typeof layersHeader>, "layers">} LayersHeader */
 /** @typedef {{kind: 5, sequence: number, header: LayersHeader, layers: LayerData[]}} LayersFrame */
@@ -229,7 +229,7 @@ export function decodeFrame(buffer) {
 }
 
 /**
- * Returns kind and sequence of a frame, even of one that cannot be decoded; null if it has none.
+ * Returns kind and sequence of a frame, even if the rest of it cannot be decoded; null if it has none.
  * @param {ArrayBuffer} buffer @returns {Pick<Frame | PartFrame, "kind" | "sequence"> | null}
  */
 export function frameNumber(buffer) {

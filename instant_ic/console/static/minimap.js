@@ -1,5 +1,5 @@
 // @ts-check
-// Map in the corner: two grids, and over them an SVG in metres with both robots, path, subgoal and predicted trajectory.
+// The map in the corner: two grids, and over them an SVG in metres with both robots, path, subgoal and predicted trajectory.
 
 /** @import { GridHeader, Plan } from "./messages.js" */
 /** @import { Vec3 } from "./math.js" */
@@ -60,7 +60,8 @@ export class MiniMap {
   }
 
   /**
-   * Returns the transform from the map frame to pixels of the element. Small: heading up; large: north up, the whole map.
+   * Returns the transform from the map frame to pixels of the element. The small map has the heading up; the large one shows
+   * the whole map with north up.
    * @param {Vec3} shown
    */
   _pixelsFromMap([x, y, yaw]) {
@@ -74,7 +75,7 @@ export class MiniMap {
 }
 
 /**
- * Returns a transform from the map, whose y axis points up, to pixels: turned, scaled, with one place shown at one pixel.
+ * Returns a transform from the map, whose y axis points up, to pixels. It turns by `angle` and shows `place` at `pixel`.
  * @param {number} scale @param {number} angle @param {[number, number]} place @param {[number, number]} pixel
  */
 function matrix(scale, angle, [x, y], [column, row]) {
@@ -82,7 +83,7 @@ function matrix(scale, angle, [x, y], [column, row]) {
   return `matrix(${c}, ${-s}, ${-s}, ${-c}, ${column - c * x + s * y}, ${row + s * x + c * y})`;
 }
 
-/** Moves a mark of the map; hides it without a pose. @param {string} id @param {Vec3 | null} pose @param {[number, number]} size m */
+/** Moves a mark of the map, or hides it if it has no pose. @param {string} id @param {Vec3 | null} pose @param {[number, number]} size m */
 function place(id, pose, size = [1, 1]) {
   byId(id).toggleAttribute("hidden", pose === null);
   if (pose) attribute(id, "transform", `translate(${pose[0]} ${pose[1]}) rotate(${degrees(pose[2])}) scale(${size})`);

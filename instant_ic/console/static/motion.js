@@ -6,17 +6,17 @@ import { clamp, wrapAngle } from "./math.js";
 
 const EXTRAPOLATION_MS = 200;
 export const SMOOTHING_MS = 50;
-const SNAP_RAD = 0.6, SNAP_M = 0.5; // a larger jump is shown at once
-const EASED_RAD = 0.2, EASED_M = 0.3; // a larger offset between the two robots is not eased out
+const SNAP_RAD = 0.6, SNAP_M = 0.5; // larger jumps are not smoothed
+const EASED_RAD = 0.2, EASED_M = 0.3; // larger offsets between the two robots are not eased out
 
 export class Motion {
   constructor() {
     /** @type {Vec3 | null} x, y, yaw in the map frame; null: unknown. */
     this.pose = null;
     this.easeMs = 0;
-    /** @type {Vec3 | null} Pose of the shown robot without the remaining offset of the other one. */
+    /** @type {Vec3 | null} Pose of the shown robot, without the offset that is still eased out. */
     this.own = null;
-    /** @type {Vec3} Remaining offset of the other robot's pose. */
+    /** @type {Vec3} Offset of the robot shown before, at the switch; it is eased out. */
     this._residual = [0, 0, 0];
     this._easedMs = 0;
     this._robot = "";
@@ -41,12 +41,12 @@ export class Motion {
       this.own = target;
     }
     this._robot = robot;
-    // Move on at the velocity and smooth only the remaining error, so that steady motion is shown without lag.
+    // The pose moves on at the velocity, and only the error is smoothed, so that steady motion is shown without lag.
     const went = this.own && advanced(this.own, twist, ageMs < EXTRAPOLATION_MS ? elapsedMs / 1000 : 0);
     const left = went ? difference(target, went) : null;
     if (!went || !left || size(left) > SNAP_M || Math.abs(left[2]) > SNAP_RAD) this.own = target;
     else this.own = sum(went, left, 1 - Math.exp(-elapsedMs / SMOOTHING_MS));
-    this._easedMs += elapsedMs; // elapsed, not absolute: after a short hang the page continues where it was
+    this._easedMs += elapsedMs; // summed over frames, so that after a short hang the easing continues where it was
     const t = this.easeMs > 0 ? clamp(this._easedMs / this.easeMs, 0, 1) : 1;
     this.pose = sum(this.own, this._residual, 1 - t * t * (3 - 2 * t));
   }

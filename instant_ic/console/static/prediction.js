@@ -1,25 +1,25 @@
 // @ts-check
-// Pose of the v-bot now, predicted from the last state message with the operator's later commands and the v-bot's kinematics.
+// The v-bot's present pose, predicted from the last state message by the operator's later commands and the v-bot's kinematics.
 
 /** @import { Vec3 } from "./math.js" */
 /** @typedef {[number, number]} Twist m/s, rad/s */
 import { clamp } from "./math.js";
 import { advanced } from "./motion.js";
 
-const MOST_MS = 250; // longest time that is predicted
-const MOST_DELAY_MS = 100; // longest delay of a command that is predicted
+const MOST_MS = 250; // longest predicted time
+const MOST_DELAY_MS = 100; // longest delay of a command for which the prediction allows
 const STEP_MS = 10;
-const SETTLED_MS = 700; // after this age of a command, the robot keeps the speed of the state
+const SETTLED_MS = 700; // age of the last command after which the state's speed is kept
 
 export class Prediction {
   constructor() {
     /** @type {[number, number]} Largest change of the speed, m/s² and rad/s². */
     this.maxAccel = [0, 0];
-    /** @type {{at: number, twist: Twist}[]} Commands and the times from which on they were sent, oldest first. */
+    /** @type {{at: number, twist: Twist}[]} Commands with the times of their first sending, oldest first. */
     this._commands = [];
   }
 
-  /** Takes a command of this page. @param {Twist} twist @param {number | null} now server's clock, ms */
+  /** Records a command of this page. @param {Twist} twist @param {number | null} now server's clock, ms */
   command(twist, now) {
     if (now === null) {
       this._commands = [];
@@ -32,9 +32,9 @@ export class Prediction {
   }
 
   /**
-   * Returns pose and twist at `now`, predicted from those of a state at the time `at`; server's clock, ms.
+   * Returns pose and twist at the time `now`, predicted from those of a state at the time `at` (server's clock, ms).
    * @param {Vec3} pose @param {Twist} twist @param {number} at @param {number} now
-   * @param {number} delayMs delay of a command: the state does not include commands sent less than this before it
+   * @param {number} delayMs delay of a command; commands sent within this time before the state are not in it yet
    * @returns {{pose: Vec3, twist: Twist}}
    */
   from(pose, twist, at, now, delayMs) {
@@ -53,10 +53,10 @@ export class Prediction {
       speed = next;
       t += step;
     }
-    return { pose, twist: end < now ? [0, 0] : speed }; // an old state is not predicted further
+    return { pose, twist: end < now ? [0, 0] : speed }; // beyond MOST_MS the pose stands still
   }
 
-  /** Returns the command at a time; null before the first. @param {number} t @returns {Twist | null} */
+  /** Returns the command at a time; null before the first one. @param {number} t @returns {Twist | null} */
   _at(t) {
     for (let i = this._commands.length - 1; i >= 0; i--) if (this._commands[i].at <= t) return this._commands[i].twist;
     return null;

@@ -12,7 +12,7 @@ void main() {
 }`;
 
 export class Program {
-  /** Without a vertex shader it fills the target. @param {WebGL2RenderingContext} gl @param {string} fragment @param {string} vertex */
+  /** Makes a program, which without a vertex shader fills the target. @param {WebGL2RenderingContext} gl @param {string} fragment @param {string} vertex */
   constructor(gl, fragment, vertex = WHOLE) {
     this._gl = gl;
     this.linked = link(gl, `#version 300 es\n${vertex}`, `#version 300 es\n${fragment}`);
@@ -20,7 +20,7 @@ export class Program {
     this._places = {};
   }
 
-  /** Uses it with all of its uniforms. @param {Record<string, Uniform>} uniforms */
+  /** Makes this the current program, with all of its uniforms. @param {Record<string, Uniform>} uniforms */
   use(uniforms) {
     const gl = this._gl;
     let unit = 0;
@@ -38,7 +38,7 @@ export class Program {
     }
   }
 
-  /** Fills the target. @param {Record<string, Uniform>} uniforms */
+  /** Fills the target by this program. @param {Record<string, Uniform>} uniforms */
   fill(uniforms) {
     this.use(uniforms);
     this._gl.drawArrays(this._gl.TRIANGLES, 0, 3);

@@ -1,10 +1,10 @@
 // @ts-check
-// Saves the view as a file on the operator's machine.
+// Saving the view as a file on the operator's machine.
 
 import { toast } from "./hud.js";
 
 /**
- * Saves the shown view without the overlay, at the window's full resolution. `render` renders it into the canvas.
+ * Saves the shown view without the overlay, at the window's full resolution. `render` renders the view into the canvas.
  * @param {HTMLCanvasElement} canvas @param {() => void} render
  */
 export function saveView(canvas, render) {
@@ -12,10 +12,10 @@ export function saveView(canvas, render) {
   canvas.width = Math.round(canvas.clientWidth * devicePixelRatio);
   canvas.height = Math.round(canvas.clientHeight * devicePixelRatio);
   const stamp = new Date().toLocaleString("sv").replaceAll(/[-:]/g, "").replace(" ", "_"); // Swedish time is ISO 8601
-  render(); // WebGL discards the image after the task that rendered it
+  render(); // needed here, because WebGL discards an image after the task that rendered it
   canvas.toBlob((blob) => {
     if (blob) download(blob, `view_${stamp}.png`);
-    else toast("Not saved: the browser could not encode the image.");
+    else toast("The view was not saved: the browser could not encode the image.");
   }, "image/png");
   canvas.width = width;
   canvas.height = height;

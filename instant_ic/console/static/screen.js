@@ -1,6 +1,6 @@
 // @ts-check
-// Renders the main image if it has changed, and shows trajectory, compass and map. Frames follow each other while something
-// moves; otherwise a message, an image or an input requests the next one.
+// Renders the main image if it has changed, and shows trajectory, compass and map. While something moves, frames follow each
+// other. Otherwise a message, an image or an input requests the next frame.
 
 /** @import { PageSettings, Plan, State } from "./messages.js" */
 /** @import { Images, Scene } from "./images.js" */
@@ -23,7 +23,7 @@ const MAX_FOV = radians(149);
 const LATENCY_MS = 250;
 const SLOW_FRAME_MS = 45; // shortest frame time when the CPU renders, with fewer pixels
 const SLOW_PIXELS = 0.45; // share of the window's pixels per axis
-const STILL_PIXELS = 0.5, LEAST_PIXELS = 0.3; // smallest turn that is rendered while the robot stands, and while the v-bot drives
+const STILL_PIXELS = 0.5, LEAST_PIXELS = 0.3; // smallest turn that is rendered while the robot stands and while the v-bot moves
 
 export class Screen {
   /** @param {GlViewer} viewer @param {Images} images @param {Look} look @param {Link} link @param {Lease} lease */
@@ -54,13 +54,13 @@ export class Screen {
     document.addEventListener("visibilitychange", () => { this._steppedAt = performance.now(); });
   }
 
-  /** Takes a state message. @param {State} state */
+  /** Shows a state message. @param {State} state */
   take(state) {
     this.state = state;
     this.wake();
   }
 
-  /** Reports that the newest state is on the screen, or that this page needs rendered views. */
+  /** Reports to the server that the newest state is on the screen, or that this page needs rendered views. */
   _reportShown() {
     const { state, images, link } = this;
     if (!state) return;
@@ -74,7 +74,7 @@ export class Screen {
 
   /** Requests a frame. */
   wake() {
-    if (!this._wanted) this._steppedAt = performance.now(); // nothing moved until now
+    if (!this._wanted) this._steppedAt = performance.now(); // nothing has moved until now
     this._wanted = true;
     this._request();
   }
@@ -103,7 +103,7 @@ export class Screen {
     if (this._wanted || this.viewer.busy) this._request();
   }
 
-  /** Sends the look direction, and renders what has changed; returns whether something moves. @param {number} now */
+  /** Sends the look direction and renders the changes; returns whether something moves. @param {number} now */
   _renderFrame(now) {
     const elapsed = Math.min(Math.max(now - this._steppedAt, 0), 200);
     this._steppedAt = Math.max(now, this._steppedAt);
@@ -138,13 +138,13 @@ export class Screen {
     this.wake();
   }
 
-  /** Tangents of half the shown field of view: horizontal, vertical. @returns {[number, number]} */
+  /** Returns the tangents of half the shown field of view: horizontal, vertical. @returns {[number, number]} */
   _tanHalf() {
     const { clientWidth, clientHeight } = this.viewer.canvas, tanV = Math.tan(this.look.vfov / 2);
     return [(tanV * clientWidth) / Math.max(clientHeight, 1), tanV];
   }
 
-  /** Returns whether a direction waits to be sent. @param {[number, number]} tanHalf @param {number} now */
+  /** Sends the look direction if due; returns whether it still waits. @param {[number, number]} tanHalf @param {number} now */
   _sendLook(tanHalf, now) {
     const { yaw, pitch } = this.look;
     const [hfov, vfov] = tanHalf.map((tan) => Math.min(2 * Math.atan(tan), MAX_FOV));
@@ -158,8 +158,8 @@ export class Screen {
   }
 
   /**
-   * Renders if a new image arrived, the direction changed visibly, or the window size changed. Returns whether
-   * the shown place or the blend has changed, so that the next frame is likely to differ too.
+   * Renders if a new image has arrived, or if the direction or the window's size has changed visibly. Returns whether the
+   * shown place or the blend has changed, since the next frame is then likely to differ too.
    * @param {Scene} scene
    */
   _renderView(scene) {
@@ -202,7 +202,7 @@ export class Screen {
     });
   }
 
-  /** Position of the shown camera in the map frame; null: unknown. @returns {Vec3 | null} */
+  /** Returns the position of the shown camera in the map frame; null if unknown. @returns {Vec3 | null} */
   _cameraPosition() {
     const { motion, blend, place } = this.images, [x, y, z] = this.settings.camera;
     if (!motion.pose) return null;

@@ -1,5 +1,5 @@
 // @ts-check
-// Texts of the overlay, chosen by codes: modes, node names and states. No logic depends on a text of the robot.
+// Texts of the overlay, chosen by codes: modes, node names and states. No logic depends on the robot's texts.
 
 /** @import { RecordingStatus, Session, State, Vspace } from "./messages.js" */
 
@@ -15,7 +15,7 @@ const MODES = {
   none: ["WAITING", "No controller is running"],
 };
 
-/** @type {Partial<Record<Mode, string>>} Announced by screen readers; transitional modes are not. */
+/** @type {Partial<Record<Mode, string>>} Announcements of modes by screen readers; transitional modes are not announced. */
 export const ANNOUNCED = {
   real: "Real view: you see through the robot's camera",
   virtual: "Virtual view: you drive the virtual robot, and the robot follows",
@@ -42,7 +42,7 @@ export function modeText(state, driver) {
   return { name, reason: sentence(state?.reason) || (mode === "real" && driver === "you" ? "You drive the robot" : usual) };
 }
 
-/** @param {Session["driver"]} driver @param {number} watchers @param {string} door through which another one drives */
+/** @param {Session["driver"]} driver @param {number} watchers @param {string} door connection of another operator who drives */
 export function leaseText(driver, watchers, door = "") {
   return {
     you: watchers > 0 ? `You are driving · ${watchers} watching` : "You are driving",
@@ -75,8 +75,8 @@ export function vspaceQuality(vspace) {
 }
 
 /**
- * Returns the banner, by priority: lost link, emergency stop, key held through a stop; null: none.
- * `held`: the robot is stopped and the operator still holds a control.
+ * Returns the banner, in order of priority for a lost link, an emergency stop, and a control held while the robot is stopped
+ * (`held`); null for none of them.
  * @param {{lost: boolean, estop: boolean, held: boolean, driver: Session["driver"], reason: string}} situation
  */
 export function bannerText({ lost, estop, held, driver, reason }) {
@@ -84,7 +84,7 @@ export function bannerText({ lost, estop, held, driver, reason }) {
   if (estop) {
     const release = driver === "you";
     const usual = release ? "Release the emergency stop to continue." : "Only the driver can release the emergency stop.";
-    return { title: "EMERGENCY STOP", text: sentence(reason) || usual, release }; // the reason says what holds the robot
+    return { title: "EMERGENCY STOP", text: sentence(reason) || usual, release }; // the reason says what keeps the robot stopped
   }
   return held ? { title: "STOPPED", text: "Release the controls to continue.", release: false } : null;
 }
@@ -92,14 +92,14 @@ export function bannerText({ lost, estop, held, driver, reason }) {
 /** @type {Record<string, string>} Button text in states of the recorder other than recording. */
 const RECORDER = { ending: "Saving…", "disk full": "Disk full", failed: "Failed" };
 
-/** Text of the record button. @param {RecordingStatus} status */
+/** Returns the text of the record button. @param {RecordingStatus} status */
 export const recordText = (status) =>
   status.state === "recording" ? `${clockText(status.seconds)} · ${bytesText(status.bytes ?? 0)}` : recorderText(status.state) || "Record";
 
 /** @param {string} state */
 export const recorderText = (state) => (Object.hasOwn(RECORDER, state) ? RECORDER[state] : "");
 
-/** Minutes and seconds. @param {number | null} seconds */
+/** Returns minutes and seconds as text. @param {number | null} seconds */
 export function clockText(seconds) {
   const whole = Math.floor(seconds ?? 0);
   return `${Math.floor(whole / 60)}:${String(whole % 60).padStart(2, "0")}`;

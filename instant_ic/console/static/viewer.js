@@ -1,5 +1,5 @@
 // @ts-check
-// The view in WebGL 2: the camera's image and the virtual space, by one renderer.
+// The view in WebGL 2: the camera's image and the virtual space, rendered alike.
 
 /** @import { Scene } from "./images.js" */
 /** @import { Layer } from "./layers.js" */
@@ -11,14 +11,14 @@ import { createTexture, Program, setImage } from "./program.js";
 
 const DARK = [9, 11, 14]; // before the first image
 
-// A rendered view of the server, which fades out towards its edge.
+// A view rendered by the server, which fades out towards its edge.
 const FRAGMENT = `
 precision highp float;
 in vec2 screen;
 out vec4 colour;
 uniform sampler2D view;
 uniform mat3 viewFromLook;
-uniform vec2 tanHalf, viewTanHalf; // of the shown field of view and of the rendered one
+uniform vec2 tanHalf, viewTanHalf; // of the shown field of view and of the rendered view's
 uniform vec3 gain;
 void main() {
   vec3 d = viewFromLook * vec3(1.0, -screen.x * tanHalf.x, screen.y * tanHalf.y);
@@ -27,7 +27,7 @@ void main() {
   colour = vec4(rgb * gain, d.x > 0.0 ? edge.x * edge.y : 0.0);
 }`;
 
-/** Width and height of the samples, pixels. */
+/** Width and height of the sampled images in pixels. */
 const SAMPLE = /** @type {const} */ ([64, 40]);
 // Pause after a frame that the CPU rendered, as a share of its duration, and the longest pause.
 const REST = 0.3, MOST_REST_MS = 100;
@@ -37,7 +37,7 @@ const REST = 0.3, MOST_REST_MS = 100;
 export class GlViewer {
   /**
    * Throws when WebGL 2 is missing.
-   * @param {HTMLCanvasElement} canvas @param {boolean} full all pixels, also where the CPU renders
+   * @param {HTMLCanvasElement} canvas @param {boolean} full render all pixels, even on the CPU
    */
   constructor(canvas, full = false) {
     const gl = canvas.getContext("webgl2", {
@@ -47,7 +47,7 @@ export class GlViewer {
     this.canvas = canvas;
     const info = gl.getExtension("WEBGL_debug_renderer_info");
     const renderer = String(gl.getParameter(info ? info.UNMASKED_RENDERER_WEBGL : gl.RENDERER));
-    // Software rendering: the page then uses fewer pixels and plain look-ups.
+    // With software rendering, the page uses fewer pixels and plain look-ups.
     this.slow = !full && /swiftshader|llvmpipe|software|basic render/i.test(renderer);
     this.lost = false;
     canvas.addEventListener("webglcontextlost", () => { this.lost = true; });
@@ -56,12 +56,12 @@ export class GlViewer {
     this._panorama = createTexture(gl, DARK);
     this._view = createTexture(gl, DARK);
     this._samples = this._target(...SAMPLE);
-    /** @type {WebGLSync | null} Signalled when the CPU has rendered the last frame. */
+    /** @type {WebGLSync | null} Fence that is signalled when the CPU has rendered the last frame. */
     this._fence = null;
     this._renderedAt = 0;
     /** Earliest time of the next frame, which leaves time for messages and new views. */
     this.restUntil = 0;
-    // The driver translates a program at its first use, which must not delay the first frame after a switch.
+    // Drivers translate a program at its first use. Using each now keeps this from delaying the first frame after a switch.
     gl.viewport(0, 0, 1, 1);
     this._renderer.renderFar(this._panorama, identity, [1, 1]);
     this._renderView({ viewFromLook: identity, tanHalf: [1, 1], viewTanHalf: [1, 1] }, plain);
@@ -77,7 +77,7 @@ export class GlViewer {
     setImage(this.gl, this._view, bitmap);
   }
 
-  /** Replaces the layers that are rendered for a scene with their camera. @param {Layer[]} layers */
+  /** Replaces the layers, which are rendered for scenes with a place. @param {Layer[]} layers */
   loadLayers(layers) {
     const first = !this._renderer.ready;
     this._renderer.load(layers);
@@ -105,7 +105,7 @@ export class GlViewer {
     gl.flush();
   }
 
-  /** True while the CPU renders the last frame. Read it until it is false. */
+  /** True while the CPU renders the last frame. It must be read until it is false. */
   get busy() {
     const gl = this.gl;
     if (!this._fence || this.lost) return false;
@@ -118,8 +118,8 @@ export class GlViewer {
   }
 
   /**
-   * Returns panorama and view, small, in one projection and without colour matching; `weights` are 0 where the view shows
-   * estimated surfaces.
+   * Returns small images of panorama and view in the same projection, without colour matching. `weights` are 0 where the
+   * view shows estimated surfaces.
    * @param {Scene} scene @returns {Samples}
    */
   sample(scene) {
@@ -152,7 +152,7 @@ export class GlViewer {
     if (scene.place && this._renderer.ready) return this._renderer.render({ ...scene, position: scene.place }, width, height, gain);
     const gl = this.gl;
     gl.viewport(0, 0, width, height);
-    // Beyond the rendered view's edge the camera's image continues, dim and grey.
+    // Beyond the rendered view's edge, the camera's image is shown dim and grey.
     this._renderer.renderFar(this._panorama, scene.panoramaFromLook, scene.tanHalf, plain, 0, 1);
     gl.enable(gl.BLEND);
     gl.blendFuncSeparate(gl.SRC_ALPHA, gl.ONE_MINUS_SRC_ALPHA, gl.ONE, gl.ZERO);
