@@ -104,7 +104,7 @@ class ZenohGatewayNode(Node[ZenohGatewayConfig]):
                 self.diagnose("commands", level, text)
                 self._no_commands = text if level == ERROR else ""
             if json.loads(self._zenoh.get_json("mode")) != "client":
-                self.opened(RosSession(self._zenoh, config.domain))
+                self.connect(RosSession(self._zenoh, config.domain))
         except ZenohError as error:
             raise NodeError(str(error)) from None
         if self.session is None:  # a client's router may start later
@@ -128,6 +128,13 @@ class ZenohGatewayNode(Node[ZenohGatewayConfig]):
         if self.stopping:
             session.close()
             return
+        try:
+            self.connect(session)
+        except registry.RegistryError as error:
+            self.diagnose("link", WARN, f"{error}; trying again")
+
+    def connect(self, session: RosSession) -> None:
+        """Set up the topics in a session; close the session if that fails."""
         config = self.config
         try:
             own = RosNode(session, config.prefix or "/", self.node_name)
@@ -137,7 +144,7 @@ class ZenohGatewayNode(Node[ZenohGatewayConfig]):
             outgoing = Outgoing(self, own, config.prefix, config.publish, incoming.wants)
             session.watch(incoming.on_token)
         except Exception:
-            session.close()  # a client opens another one
+            session.close()
             raise
         self.session, self.incoming, self.outgoing = session, incoming, outgoing
         self.look()

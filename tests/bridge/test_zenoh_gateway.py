@@ -528,10 +528,10 @@ def test_a_session_whose_topics_cannot_be_set_up_is_closed_and_opened_again(worl
     monkeypatch.setattr("nodes.zenoh_gateway.Outgoing", outgoing)
     monkeypatch.setattr("nodes.zenoh_gateway.RETRY_S", 0.2)
     gateway = world.gateway("robot", commands=COMMANDS, insecure_loopback_commands=True)
+    wait_for(lambda: "no space left for sockets; trying again" in gateway.told("link"), "the reason")
     wait_for(lambda: "messages out" in gateway.told("topics"), "counts of the second session")
-    told = " ".join(text for _, text, _ in gateway.node.diagnoses().values())
-    assert "no space left for sockets" in told
-    assert "AttributeError" not in told
+    wait_for(lambda: "1 routers" in gateway.told("link"), "the second session's link")
+    assert not any("AttributeError" in text for _, text, _ in gateway.node.diagnoses().values())
     assert sessions[0].zenoh.is_closed() and not sessions[1].zenoh.is_closed()
 
 
