@@ -133,40 +133,42 @@ GUARDS: dict[str, str] = {
     "estop_pressed": "the emergency stop is latched",
     "source_lost": "a source that this state needs has been silent for stop_after_s (camera, views: twice their "
     "time-out if longer)",
-    "interrupted": "the arbiter has not stepped, or the commands of a held key have ceased, for stop_after_s, or their "
-    "sender has changed; its machine was suspended; crawler_base, navigator, virtual_robot or the console restarted",
-    "pose_lost": "the SLAM is lost with a probability of pose_trust.stop or more, or the pose (or the shown v-bot's) "
-    "has jumped by pose_trust.jump_m or jump_deg; after a release the r-bot may drive, slowly until its place is "
-    "recognized",
-    "contradicted": "wheels and LiDAR contradict each other for 0.5 s or 0.15 m; after a release the r-bot may drive, "
-    "slowly until they have agreed for 0.3 m; a contradiction that lasts stops it again",
+    "interrupted": "the arbiter has not stepped for stop_after_s, or its machine was suspended; the commands of a "
+    "held key have stopped for stop_after_s, or their sender has changed; crawler_base, navigator, virtual_robot or "
+    "the console has restarted",
+    "pose_lost": "the SLAM is lost with a probability of pose_trust.stop or more, or the pose of the r-bot or of the "
+    "shown v-bot has jumped by pose_trust.jump_m or jump_deg; once the controls are released, the r-bot may drive "
+    "slowly until its place is recognized",
+    "contradicted": "wheels and LiDAR contradict each other for 0.5 s or 0.15 m; once the controls are released, the "
+    "r-bot may drive slowly until they have agreed for 0.3 m; a contradiction that lasts stops it again",
     "vspace_lost": "the virtual space has failed, or its node is silent",
-    "obstacle_and_ready": "the predicted path meets an obstacle, the virtual space is ready, the r-bot has a way "
-    "round; after an abandoned entry, also: a view fits, or the operator let go",
+    "obstacle_and_ready": "the predicted path meets an obstacle, the virtual space is ready, and the r-bot has a way "
+    "round; after an abandoned entry, a view must have fitted or the operator have let go since",
     "vspace_not_ready": "the virtual space is no longer ready",
     "no_view_in_time": "no view fits after enter_timeout_s plus the delay of an image and a view",
-    "way_free": "the command is safe for the r-bot as in `rejoined`",
+    "way_free": "the command is safe for the r-bot over the same horizons as in `rejoined`",
     "view_fits": "the places of the newest view and the newest camera image agree within picture_position_m and "
-    "picture_yaw_deg, and an operator is there",
-    "rejoined": "r-bot and v-bot agree for return_dwell_s, to within return_near_m or for return_patience_s; the "
-    "command is safe for the r-bot over the prediction horizon and over a longer and wider one",
+    "picture_yaw_deg, and the operator's command is fresh",
+    "rejoined": "r-bot and v-bot have agreed for return_dwell_s and are within return_near_m, or have agreed for "
+    "return_patience_s; the command is safe for the r-bot over the prediction horizon and over a longer and wider "
+    "one",
     "unsafe_again": "the command leads the r-bot into an obstacle again",
-    "image_fits": "the v-bot is on the r-bot within return_picture_m and return_picture_yaw_deg, the r-bot turns no "
-    "faster than return_turn_rad_s, and view and image agree as closely (after return_timeout_s the first is enough, "
-    "after twice that nothing is required)",
+    "image_fits": "the v-bot is within return_picture_m and return_picture_yaw_deg of the r-bot, the r-bot turns no "
+    "faster than return_turn_rad_s, and view and image agree within the same limits; after return_timeout_s the "
+    "first condition is enough, and after twice that time none is needed",
     "may_resume": "the emergency stop is released, every source has been fresh for recover_s, images arrive at least "
-    "every slowest_image_s, the command has been zero for 0.1 s (or silent for 1 s, no key held before), and the "
-    "operator's link is back after `interrupted` or its loss",
+    "every slowest_image_s, the command has been zero for 0.1 s (or silent for 1 s if no key was held), and after "
+    "`interrupted` or a lost link the operator's commands are fresh again",
 }
 
 ACTIONS: dict[str, str] = {
     "stop": "command zero; show the camera",
     "call_vbot": "request views of the v-bot's pose; slow the r-bot",
     "place_vbot": "drive and show the v-bot, from the pose of the shown image",
-    "ease_vbot": "drive the r-bot, ease the v-bot onto it, keep showing the v-bot",
+    "ease_vbot": "drive the r-bot, ease the v-bot onto it, and keep showing the v-bot",
     "drive_vbot_on": "drive the v-bot again, from its present pose",
     "hand_back": "drive and show the r-bot",
-    "abandon_entry": "as hand_back; no new entry until a view fits or the operator lets go",
+    "abandon_entry": "like hand_back, but no new entry until a view fits or the operator lets go",
 }
 
 
