@@ -146,7 +146,7 @@ GUARD_FUNCTIONS: dict[str, Callable[[Snapshot], bool]] = {name: globals()[name] 
 def hold(s: Snapshot) -> Notice | None:
     """Return why the robots must not move in this state; None if they may."""
     if s.settles:
-        return Notice(Reason.INTERRUPTED, "The robot's control stood still for a moment. The robot has stopped.")
+        return Notice(Reason.INTERRUPTED, "The robot's controller paused for a moment. The robot has stopped.")
     if s.stale:
         return stale_notice(s.stale)
     if s.inputs.robot_pose is None:

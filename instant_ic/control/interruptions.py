@@ -35,7 +35,7 @@ class Interruptions:
         if math.isinf(self.gap_s):
             return Notice(Reason.INTERRUPTED, "This computer was suspended.")
         if self.gap_s > longest_s:
-            return Notice(Reason.INTERRUPTED, f"The robot's control stood still for {self.gap_s:.1f} s.")
+            return Notice(Reason.INTERRUPTED, f"The robot's controller paused for {self.gap_s:.1f} s.")
         if new:
             names = ", ".join(sorted({f"{WATCHED[key]} ({publisher})" for key, publisher in new}))
             return Notice(Reason.INTERRUPTED, f"The {names} was restarted.")
