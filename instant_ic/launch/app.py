@@ -79,7 +79,10 @@ def run_stack(
         finally:
             for folder in folders:
                 registry.sweep(folder)
-            output.close(status)
+            try:
+                locks.close()  # before a blocked terminal ends the process: this run has ended cleanly
+            finally:
+                output.close(status)
         return status
 
 

@@ -400,6 +400,7 @@ def test_a_stack_runs_on_and_ends_well_while_its_terminal_takes_nothing(tmp_path
             time.sleep(0.05)
         launched.send_signal(signal.SIGINT)
         assert launched.wait(30) == 0
+        assert not (tmp_path / "r" / "run.json").exists()  # a clean end: the next start is not stopped
     finally:
         launched.kill()
         launched.wait()
