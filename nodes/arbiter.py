@@ -55,7 +55,7 @@ class ArbiterNode(Node[ArbiterConfig]):
         points = self.latest("/lidar/points", msg.PointCloud2, 10.0) if c.costmap.points.enabled else None
         shown = Latest(self.clock, 1.0)
         vspace = self.latest("/vspace/status", msg.VspaceStatus, 60.0, qos=LATCHED)
-        # A doubt holds until the next report. The age of /pose shows a SLAM that is gone.
+        # A doubt holds until the next report. A dead SLAM shows in the age of /pose.
         integrity = self.latest("/slam/integrity", msg.PoseIntegrity, float("inf"))
         self.inbox = ArbiterInbox(self.clock, self.surroundings, self.view, sources, points, shown, vspace, integrity)
         self.inbox.gate.limits = command_limits(c.timeouts)
@@ -64,11 +64,11 @@ class ArbiterNode(Node[ArbiterConfig]):
         self.subscribe_received("/view/shown", self.on_shown, qos=SENSOR, message_class=msg.ShownPictures)
         self.subscribe_received("/operator/estop", self.on_estop, qos=LATCHED, message_class=msg.Bool)
         self.subscribe_received("/robot/estop", self.on_button, qos=LATCHED, message_class=msg.Bool)
-        # Only its age matters: the image is never decoded here.
+        # Only the image's age matters, so it is never decoded here.
         self.subscribe_received("/camera/image/compressed", lambda r: self.view.camera_image(r.published_ns), SENSOR)
         self.timer(WALL_PERIOD_S, self.walls.update)
         self.timer(1.0 / c.costmap.update_frequency, self.update_costmap)
-        self.cancel_extra = lambda: None  # cancels a step between two timers
+        self.cancel_extra = lambda: None  # cancels the extra step between two timer steps
         self.timer(1.0 / c.rate_hz, self.on_timer)
 
     def reconfigure(self, config: ArbiterConfig) -> None:
@@ -78,9 +78,9 @@ class ArbiterNode(Node[ArbiterConfig]):
         self.warn_of_protection()
 
     def warn_of_protection(self) -> None:
-        """Warn as long as a protection is off."""
+        """Show a warning while a protection is off."""
         if off := self.config.unprotected_by:
-            text = "the robot does not stop before an obstacle. Switch it on and restart with unprotected: false"
+            text = "the robot does not stop before obstacles. Switch it on and restart with unprotected: false"
             self.diagnose("protection", WARN, f"Protection is off ({', '.join(off)}): {text}")
         else:
             self.diagnose("protection", OK, "on")
@@ -90,28 +90,28 @@ class ArbiterNode(Node[ArbiterConfig]):
             self.cmd_vel.publish(msg.twist_stamped(0.0, 0.0, self.clock.now_ns(), msg.HARD_STOP))
 
     def on_estop(self, received: Received) -> None:
-        """Obey a press at once; a release only by the rule of ``EstopLatch``."""
+        """Obey a press at once, and a release only if ``EstopLatch`` permits it."""
         pressed, holder = bool(msg.deserialize(received.payload, received.type_name).data), self.inbox.lease.holder
         if refused := self.latch.hear(pressed, received.publisher, received.publish_ns, self.clock.now_ns(), holder):
             self.log.warning("emergency stop: %s", refused)
         self.step_and_save()
 
     def on_button(self, received: Received) -> None:
-        """Obey the robot's own emergency stop; its release ends nothing: the operator must release the stop."""
+        """Obey the robot's own emergency stop. After its button is released, the operator must release the stop."""
         pressed = bool(msg.deserialize(received.payload, received.type_name).data)
         self.inbox.button_ns = received.published_ns
         self.latch.hear_button(pressed, received.publisher, received.publish_ns)
         self.step_and_save()
 
     def step_and_save(self) -> None:
-        """Step at once, then save the emergency stop, so that no restart of a node or of the machine ends it."""
+        """Step at once, then save the emergency stop, so that it survives a restart of a node or of the machine."""
         try:
             self.tick()
-        finally:  # whatever input the step fails at
+        finally:  # also if the step fails
             self.diagnose_all(self.latch.save())
 
     def on_command(self, received: Received) -> None:
-        """Obey the holder of the robot's lease, and step at once when his command has changed."""
+        """Take a command of the lease's holder, and step at once if the command has changed."""
         lease, before = self.inbox.lease, self.inbox.lease.holder
         taken = self.inbox.take_command(received)
         if lease.holder != before:
@@ -137,16 +137,16 @@ class ArbiterNode(Node[ArbiterConfig]):
     def tick(self) -> None:
         rests = self.inbox.rests(self.arbiter.mode)
         if self.times.begin_step(self.clock.steady_ns(), rests):
-            self.update_costmap()  # the first command of a drive is checked against what is there now
+            self.update_costmap()  # so that the first command of a drive is checked against the present obstacles
         now_ns = self.clock.now_ns()
         points_every_s = REST_COSTMAP_S if rests else 0.0
         inputs = self.inbox.inputs(self.latch, self.walls.found, self.config.timeouts, points_every_s)
         self.times.obeyed = inputs.operator_command
-        # Steady time: setting the clock back must not make a stale source look fresh.
+        # The steady clock is used, so that setting the clock back does not make a stale source look fresh.
         decision = self.arbiter.step(inputs, self.clock.steady_ns())
         self.cmd_vel.publish(command_message(decision, now_ns))
         self.publish_decision(decision, inputs, now_ns)
-        # One more step if the next timer may be later than a time-out: time-outs are exact.
+        # Step at the next time-out if the timer may be later, so that time-outs are exact.
         self.cancel_extra()
         stale_in_s = self.arbiter.stale_in_s(inputs, self.clock.steady_ns())
         if stale_in_s < max(REST_STEP_S, 1.0 / self.config.rate_hz):

@@ -1,4 +1,4 @@
-"""Plays a bag onto the bus, with /clock before each message; ends when the bag ends."""
+"""Plays a bag onto the bus, with /clock before each message, and ends with the bag."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from instant_ic.bus.clock import ManualClock
 from instant_ic.msg import message_type, register_type, to_time
 
 _BASE_PERIOD_S = 0.5
-_LINGER_S = 1.0  # after the last message, so that other nodes finish their work
+_LINGER_S = 1.0  # wait after the last message, so that other nodes can finish their work
 
 
 class BagPlayerNode(Node[BagPlayerConfig]):
-    """Publishes a bag's messages from its own thread; with ``use_sim_time`` the node's clock is the bag's."""
+    """Publishes a bag's messages from a thread of its own. With ``use_sim_time``, the node's clock follows the bag."""
 
     name = "bag_player"
     live_parameters = ("rate",)
@@ -39,7 +39,7 @@ class BagPlayerNode(Node[BagPlayerConfig]):
         self._clock_out: Publisher | None = None
         if self.config.publish_clock:
             self._clock_out = self.publisher("/clock", message_type("Clock"), RELIABLE)
-        for topic in self.player.topics:  # foreign message types are defined in the bag
+        for topic in self.player.topics:  # the bag contains the definitions of foreign message types
             register_type(topic.type_name, topic.schema.text)
         self._out = {t.topic: self.publisher_raw(t.topic, t.type_name, t.qos) for t in self.player.topics}
         for name, why in self.player.left_out.items():
@@ -58,7 +58,7 @@ class BagPlayerNode(Node[BagPlayerConfig]):
         """Check the run directory for a base, real or simulated, that could obey the played messages.
 
         Raises:
-            BagError: there is one, and ``force`` is not set.
+            BagError: there is such a base, and ``force`` is not set.
         """
         assert self.player is not None
         if self.run_dir is not None and not self.config.force:
@@ -79,7 +79,7 @@ class BagPlayerNode(Node[BagPlayerConfig]):
                 self._stop.wait(_LINGER_S)
         except (BagError, NodeError) as error:
             self._failed = str(error)
-        except Exception as error:  # otherwise the thread would be gone and the node would wait for ever
+        except Exception as error:  # otherwise the thread would end silently and the node would wait for ever
             self.log.exception("player")
             self._failed = f"{type(error).__name__}: {error}"
         self.stop()
@@ -92,12 +92,12 @@ class BagPlayerNode(Node[BagPlayerConfig]):
         payload = without_children(message, drops) if drops else message.payload
         self._publish_time(message.stamp_ns)
         if payload is not None:
-            # Not from the clock: this node also receives its own /clock, a little later, which sets the time back.
+            # Do not read the clock: this node also receives its own /clock, slightly later, which sets the time back.
             stamp_ns = message.stamp_ns if isinstance(self.clock, ManualClock) else None
             self._out[message.topic].publish_bytes(payload, stamp_ns)
 
     def _publish_time(self, stamp_ns: int) -> None:
-        """Publish the time before each message, and keep it running where there are none."""
+        """Publish the time, before each message and at intervals between messages."""
         if isinstance(self.clock, ManualClock):
             self.clock.set(stamp_ns)
         if self._clock_out is not None:
@@ -114,11 +114,11 @@ class BagPlayerNode(Node[BagPlayerConfig]):
         return {"bag": self.config.bag, **self.player.status()}
 
     def _wait_for_readers(self) -> None:
-        """Let subscribers find the topics, then wait until the nodes of ``wait_for`` are connected to all of them."""
+        """Give subscribers time to find the topics, then wait until the nodes of ``wait_for`` are connected to all."""
         assert self.player is not None
         start_ns = self.player.start_ns
 
-        def wait(seconds: float) -> bool:  # the time stands still
+        def wait(seconds: float) -> bool:  # meanwhile, the published time stands still
             self._publish_time(start_ns)
             return self._stop.wait(seconds)
 

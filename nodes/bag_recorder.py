@@ -1,4 +1,4 @@
-"""Records topics into a rosbag2 folder (MCAP), byte for byte; in snapshot mode keeps only the last seconds."""
+"""Records topics byte for byte into a rosbag2 folder (MCAP). In snapshot mode, it keeps only the last seconds."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from instant_ic.bus.registry import NodeInfo, TopicWatch, list_nodes
 from instant_ic.bus.transport import Received, Stats
 from instant_ic.msg import Bool, ControlState
 
-_NODES_S = 2.0  # period of the search for nodes, which costs more than that for topics
+_NODES_S = 2.0  # period of the search for nodes, which costs more than the search for topics
 
 
 class BagRecorderNode(Node[BagRecorderConfig]):
-    """Discovers topics, passes their bytes to the recorder, reports size and losses."""
+    """Discovers topics, passes their messages to the recorder, and reports size and losses."""
 
     name = "bag_recorder"
     live_parameters = ("duration_s", "snapshot_after_s")
@@ -42,7 +42,7 @@ class BagRecorderNode(Node[BagRecorderConfig]):
         if self.config.snapshot:
             self.subscribe("/operator/estop", Bool, lambda m: self._on_stop("operator", bool(m.data)))
             self.subscribe("/ic/state", ControlState, lambda m: self._on_stop("arbiter", bool(m.estop)))
-            self.be_patient(True)  # the discovery wakes it
+            self.be_patient(True)  # the discovery wakes the node
         self.commands = {
             "snapshot": self._snapshot,
             "record": self._record,
@@ -51,7 +51,7 @@ class BagRecorderNode(Node[BagRecorderConfig]):
         }
         self._began_s = time.monotonic()
         self._discover()
-        # A thread, not a timer: with simulated time the timers may stand still while messages already arrive.
+        # Use a thread, because timers on simulated time may stand still while messages already arrive.
         threading.Thread(target=self._look, name="discovery", daemon=True).start()
 
     def _look(self) -> None:
@@ -93,7 +93,7 @@ class BagRecorderNode(Node[BagRecorderConfig]):
         return {"path": str(path)}
 
     def _on_stop(self, who: str, stopped: bool) -> None:
-        """Write a snapshot at each stop, except one that was latched before this recorder started."""
+        """Write a snapshot at each emergency stop, except one that was latched before this recorder started."""
         before = self._stopped.get(who)
         self._stopped[who] = stopped
         if stopped and before is False:
@@ -105,7 +105,7 @@ class BagRecorderNode(Node[BagRecorderConfig]):
     def teardown(self) -> None:
         if not hasattr(self, "recorder"):
             return
-        self.read_all()  # what was published before the end belongs to the bag
+        self.read_all()  # messages published before the end belong to the bag
         try:
             self.recorder.close()
         except BagError as error:

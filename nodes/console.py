@@ -1,4 +1,4 @@
-"""Node of the operator's page: images, state and map go out; commands, emergency stop and look direction come in."""
+"""Node of the operator's page. It sends images, state and map, and receives commands, emergency stop and look."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ RECORDER_TIMEOUT_S = 3.0
 
 
 class ConsoleNode(Node[ConsoleConfig], ConsoleBackend):
-    """The page's server on the topics: ``PageFeed`` feeds it, and the node handles the operator's actions."""
+    """Connects the page's server to topics. ``PageFeed`` feeds the page, the node handles the operator's actions."""
 
     name = "console"
     live_parameters = ("view",)
@@ -34,7 +34,7 @@ class ConsoleNode(Node[ConsoleConfig], ConsoleBackend):
     def __init__(self, *wiring: Any, page: PageServer | None = None, **named: Any) -> None:
         super().__init__(*wiring, **named)
         self.page = page
-        """Receiver of images and state, but not of layers; the node's own server if None."""
+        """Receiver of images and state, but not of layers; None uses the node's own server."""
 
     def setup(self) -> None:
         config = self.config
@@ -65,11 +65,11 @@ class ConsoleNode(Node[ConsoleConfig], ConsoleBackend):
         self.subscribe("/costmap", msg.OccupancyGrid, lambda m: feed.take_grid(FrameKind.COSTMAP, m), qos=SENSOR)
         self.subscribe("/diagnostics", msg.DiagnosticArray, feed.faults.take_diagnoses, qos=RELIABLE)
         self.subscribe("/heartbeat", msg.NodeStatus, feed.faults.take_heartbeat, qos=RELIABLE)
-        self.mesher = self.background(feed.layers_of, feed.take_layers)  # 30 ms: commands must not wait for it
+        self.mesher = self.background(feed.layers_of, feed.take_layers)  # takes 30 ms, which must not delay commands
         self.layers: Subscription | None = None
         self.timer(1.0, feed.send_health)
         self.page_timers: list[Timer] = []
-        self.feed_page(self.run_dir is None)  # in lockstep there are no pages that could come
+        self.feed_page(self.run_dir is None)  # in lockstep, no page connects later
         for warning in self.server.warnings:
             self.log.warning(warning)
         if self.run_dir is not None:
@@ -79,7 +79,7 @@ class ConsoleNode(Node[ConsoleConfig], ConsoleBackend):
         try:
             self.server.start()
             self.log.info("open %s in a browser", self.server.url)
-            sign_in.unlink(missing_ok=True)  # left by a console that was killed
+            sign_in.unlink(missing_ok=True)  # may be left by a console that was killed
             if self.server.access.made_token:
                 offer_sign_in(self.server.sign_in_url, sign_in)
         except (ConsoleError, AccessError) as error:
@@ -87,10 +87,10 @@ class ConsoleNode(Node[ConsoleConfig], ConsoleBackend):
         self.timer(1.0, self.recording.poll)
 
     def feed_page(self, watched: bool) -> None:
-        """Send everything as long as there is a page; without one, only keep what a new page gets at once."""
+        """Send everything while there is a page. Without one, keep only what a new page gets at once."""
         self.feed.watched = watched
         self.be_patient(not watched)
-        if self.layers is not None:  # without a page they would cost `nerf` CPU, too
+        if self.layers is not None:  # a subscription without a page would cost CPU, also in `nerf`
             self.drop(self.layers)
             self.layers = None
         if watched and self.page is None:
@@ -119,7 +119,7 @@ class ConsoleNode(Node[ConsoleConfig], ConsoleBackend):
     # ---- Backend: the operator's actions, on the server's thread -----------------------------------
 
     def on_drive(self, linear: float, angular: float) -> None:
-        # At once: a detour through the node's thread would add latency.
+        # Publish from the server's thread, because a detour through the node's thread would add latency.
         self.command_out.publish(msg.twist_stamped(linear, angular, self.clock.now_ns(), self.server.drive.client))
 
     def on_released(self, client: str) -> None:
@@ -148,11 +148,11 @@ class ConsoleNode(Node[ConsoleConfig], ConsoleBackend):
             self.recording.snapshot()
         else:
             name = f"bookmark {datetime.now():%H:%M:%S}"
-            self.bookmark_out.publish(msg.String(data=name))  # the topic puts it into every recording and snapshot
+            self.bookmark_out.publish(msg.String(data=name))  # recorded in every recording and snapshot
             self.recording.bookmark(name)
 
     def ask_recorder(self, command: str, **arguments: Any) -> Any:
-        """Call the recorder node, on the desk's thread; raise RecorderError with a message for the operator."""
+        """Call the recorder node on the desk's thread. A RecorderError holds a message for the operator."""
         if self.run_dir is None:
             raise RecorderError("The recorder is not available: this node has no run directory.")
         try:

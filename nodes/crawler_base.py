@@ -21,10 +21,10 @@ from instant_ic.util.pace import PaceError, current
 from instant_ic.util.step_gap import BRIEF_S
 
 OWN_STEP_S = 0.1
-"""Period at which the node's thread shows the serial thread that it runs."""
+"""Period at which the node's thread records that it is running, for the serial thread."""
 
 STATE_S = 1.0
-"""Age in seconds up to which the arbiter's state counts."""
+"""Age in seconds up to which the arbiter's state is used."""
 
 
 class CrawlerBaseNode(Node[CrawlerBaseConfig]):
@@ -45,14 +45,14 @@ class CrawlerBaseNode(Node[CrawlerBaseConfig]):
             raise NodeError(str(error)) from None
         clock = self.clock
         self.controller = BaseController(config, clock.now_ns, clock.steady_ns, self.open_port, clock.suspended_ns)
-        self.stepped_ns = clock.steady_ns()  # by the node's thread
-        also = "/cmd_vel is also published by %s; it must be the arbiter alone"
+        self.stepped_ns = clock.steady_ns()  # last step of the node's thread
+        also = "/cmd_vel is also published by %s. Stop that node: only the arbiter may publish it"
         self.source = CommandSource(config, lambda publisher: self.log.warning(also, publisher))
         self.report = BaseReport(config, self.controller, self.clock.steady_ns())
         self.latch = EstopLatch()
-        self.button: bool | None = None  # whether the controller, or a faulty track, holds the base stopped
-        self.status: ControllerStatus | None = None  # the controller's newest; read by the serial thread alone
-        self.hard = False  # the newest command is a hard stop
+        self.button: bool | None = None  # whether the controller or a faulty track holds the base stopped
+        self.status: ControllerStatus | None = None  # newest status; used only on the serial thread
+        self.hard = False  # whether the newest command is a hard stop
         self.odometry = self.publisher("/wheel/odom", Odometry, qos=SENSOR)
         self.button_out = self.publisher("/robot/estop", Bool, qos=LATCHED)
         self.battery = self.publisher("/battery", BatteryState, qos=SENSOR)
@@ -61,7 +61,7 @@ class CrawlerBaseNode(Node[CrawlerBaseConfig]):
             text = f"Protection is off ({', '.join(config.unprotected_by)}): commands of any node or age move the robot"
             self.diagnose("protection", WARN, text)
         if not config.roboclaw.estop_pin:
-            text = "No stop button (roboclaw.estop_pin is empty): the robot is stopped by its operator's page alone"
+            text = "No stop button (roboclaw.estop_pin is empty): only the operator's page can stop the robot"
             self.diagnose("button", WARN, f"{text}. Wire one to the controller")
         self.diagnose_all(self.latch.diagnosis, self.source.publishers, self.report.tracks())
         self.timer(1.0, self.watch)
@@ -70,7 +70,9 @@ class CrawlerBaseNode(Node[CrawlerBaseConfig]):
         self.loop = loop_class(self.controller, config.rate_hz, self.on_step, self.on_end)
         if self.lockstep:
             self.timer(1.0 / config.rate_hz, self.loop.hurry)
-        self.state = self.latest("/ic/state", ControlState, STATE_S, LATCHED)  # who may release the emergency stop
+        self.state = self.latest(
+            "/ic/state", ControlState, STATE_S, LATCHED
+        )  # names the node that may release the emergency stop
         self.subscribe_received("/operator/estop", self.on_estop, qos=LATCHED, message_class=Bool)
         self.subscribe_received("/robot/estop", self.on_button, qos=LATCHED, message_class=Bool)
         self.subscribe_received("/cmd_vel", self.on_command, qos=SENSOR)
@@ -93,7 +95,7 @@ class CrawlerBaseNode(Node[CrawlerBaseConfig]):
         self.diagnose_all(self.source.publishers, self.source.command)
 
     def on_estop(self, received: Received) -> None:
-        """Obey any client's emergency stop here too, whatever the arbiter does."""
+        """Obey any client's emergency stop here too, independent of the arbiter."""
         pressed = bool(deserialize(received.payload, received.type_name).data)
         holder = None if self.state.message is None else self.state.message.holder
         refused = self.latch.hear(pressed, received.publisher, received.publish_ns, received.received_ns, holder)
@@ -102,7 +104,7 @@ class CrawlerBaseNode(Node[CrawlerBaseConfig]):
         self.obey_latch()
 
     def on_button(self, received: Received) -> None:
-        """Obey another node's button; the controller's own input arrives with its status."""
+        """Obey another node's stop button. The controller's own input arrives with its status."""
         if received.publisher != self.node_name:
             pressed = bool(deserialize(received.payload, received.type_name).data)
             self.latch.hear_button(pressed, received.publisher, received.publish_ns)
@@ -119,8 +121,8 @@ class CrawlerBaseNode(Node[CrawlerBaseConfig]):
         self.diagnose_all(self.latch.diagnosis)
 
     def on_step(self, state: BaseState) -> None:
-        """Publish the result of a controller step, the odometry at once; called on the serial thread."""
-        # Without the node's thread no command arrives: the arbiter must see this as the loss of the base.
+        """Publish the result of a controller step, the odometry at once, on the serial thread."""
+        # If the node's thread hangs, no command arrives. The arbiter must see this as a loss of the base.
         if state.odometry is not None and self.clock.steady_ns() - self.stepped_ns <= BRIEF_S * 1e9:
             self.odometry.publish(estimate_message(state.odometry))
             matrix, stamp = matrix_from_pose2(state.odometry.pose), state.odometry.stamp_ns
@@ -130,7 +132,7 @@ class CrawlerBaseNode(Node[CrawlerBaseConfig]):
             self.call_soon(self.on_state, state)
 
     def note_step(self) -> None:
-        """Note a step of the node's own thread."""
+        """Record a step of the node's own thread."""
         self.stepped_ns = self.clock.steady_ns()
 
     def on_state(self, state: BaseState) -> None:
@@ -157,7 +159,7 @@ class CrawlerBaseNode(Node[CrawlerBaseConfig]):
         self.diagnose_all(self.report.battery(health))
 
     def press(self, pressed: bool) -> None:
-        """Report the robot's stop button; a fault of the controller presses it too, a faulty track for a moment."""
+        """Report the robot's stop button. A controller fault counts as pressed, a faulty track does for a moment."""
         if pressed != self.button:
             self.button = pressed
             self.button_out.publish(Bool(data=pressed))
@@ -165,13 +167,13 @@ class CrawlerBaseNode(Node[CrawlerBaseConfig]):
             self.obey_latch()
 
     def watch(self) -> None:
-        """Report the last ``recent_s``: repeats, impossible readings, dropped commands."""
+        """Report repeats, impossible readings and dropped commands in the last ``recent_s``."""
         now_ns = self.clock.steady_ns()
         self.source.update(now_ns)
         self.diagnose_all(*self.report.recent(now_ns), self.source.publishers, self.source.command)
 
     def on_end(self, fault: BaseException | None, unstopped: str) -> None:
-        """Report why the loop ended, and end the node unless it is ending anyway; called on the serial thread."""
+        """Report why the loop ended, on the serial thread. After a fault, end the node."""
         if unstopped:
             self.log.error("no stop could be sent to the motors (%s); the controller's watchdog stops them", unstopped)
         if fault is not None:

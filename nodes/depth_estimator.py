@@ -1,4 +1,4 @@
-"""Estimates the depth of the camera's panoramas (paper, section IV.B) that are requested, at a limited rate."""
+"""Estimates the depth of requested camera panoramas at a limited rate (paper, section IV.B)."""
 
 from __future__ import annotations
 
@@ -25,10 +25,10 @@ class DepthEstimatorConfig:
     Attributes:
         model: ONNX file or its manifest; a bare name is searched for in ``models/``.
         provider: execution provider; ``auto`` takes the first of TensorRT, CUDA and CPU that works.
-        threads: CPU threads per inference.
-        max_rate_hz: highest rate of estimates, per second; leaves CPU time to other nodes. Without any request, as in
-            the replay of an older bag, this is the rate.
-        max_age_s: age of an image at the end of its estimation, in seconds, above which the node warns.
+        threads: number of CPU threads per inference.
+        max_rate_hz: highest rate of estimates per second, which leaves CPU time to other nodes. Without any request, as
+            in the replay of an older bag, images are estimated at this rate.
+        max_age_s: age of an image at the end of its estimation above which the node warns, in seconds.
         timeout_s: seconds after which an inference is cancelled and reported.
     """
 
@@ -59,9 +59,11 @@ class DepthEstimatorNode(Node[DepthEstimatorConfig]):
             self.inference = Inference(config.model, config.provider, config.threads, self.stop, config.timeout_s)
         except (ManifestError, FileNotFoundError) as error:
             raise NodeError(str(error)) from error
-        self.newest: Any = None  # image
+        self.newest: Any = None  # newest image
         self.last_ns: int | None = None
-        self.wanted_ns = -math.inf  # images from this stamp on: all before the first request, then none without one
+        self.wanted_ns = (
+            -math.inf
+        )  # stamp from which an image is wanted: -inf before the first request, inf if none is pending
         self.failures = 0
         self.depth = self.publisher("/depth/raw", Image, qos=SENSOR)
         self.info = self.publisher("/depth/model", DepthModelInfo, qos=LATCHED)
@@ -75,7 +77,7 @@ class DepthEstimatorNode(Node[DepthEstimatorConfig]):
         self.inference.timeout_s = config.timeout_s
 
     def publish_model(self) -> None:
-        """Publish which kind of values ``/depth/raw`` carries, for the node that scales them."""
+        """Publish the kind of values on ``/depth/raw``, for the node that scales them."""
         manifest = self.inference.model.manifest
         self.published_provider = provider = self.inference.model.provider
         info = DepthModelInfo(
@@ -97,7 +99,7 @@ class DepthEstimatorNode(Node[DepthEstimatorConfig]):
 
     def serve(self) -> None:
         """Estimate the newest image if it is wanted, or wait for the next one."""
-        # By the images' stamps, so that a replay picks the same ones; 5 % tolerance for the camera's jitter.
+        # Use the images' stamps, so that a replay picks the same images. 5 % is tolerance for the camera's jitter.
         stamp = stamp_ns(self.newest)
         early = self.last_ns is not None and 0 <= stamp - self.last_ns < 0.95e9 / self.config.max_rate_hz
         if early or stamp < self.wanted_ns:
@@ -108,7 +110,7 @@ class DepthEstimatorNode(Node[DepthEstimatorConfig]):
         self.worker.submit(self.newest)
 
     def estimate(self, message: Any) -> tuple[Any, NDArray[np.float32] | None, str]:
-        """Run on the worker's thread; return header, depth, and an error text if there is no depth."""
+        """Estimate the depth on the worker's thread. Return header, depth, and an error text if there is no depth."""
         try:
             return message.header, self.inference.estimate(message.data), ""
         except (InferenceError, ValueError) as error:

@@ -1,4 +1,4 @@
-"""Computes metric depth from the network's estimate, the LiDAR or both, and keyframes (paper, section IV.C)."""
+"""Computes metric depth from the network's estimate, the LiDAR or both, and takes keyframes (paper, section IV.C)."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ class DepthScalerNode(Node[DepthScalerConfig]):
             except (ManifestError, FileNotFoundError) as error:
                 raise NodeError(str(error)) from error
         self.request = self.publisher("/depth/request", Header, qos=LATCHED)
-        self.request.publish(header("", 0))  # any image: from now on depth_estimator waits for requests
+        self.request.publish(header("", 0))  # requests any image; from now on, depth_estimator waits for requests
         self.scaled = self.publisher("/depth/scaled", Image, qos=SENSOR)
         self.keyframe = self.publisher("/keyframe", Keyframe, qos=LATCHED)
         self.warn_of_method()
@@ -76,14 +76,16 @@ class DepthScalerNode(Node[DepthScalerConfig]):
             self.log.warning("depth is used as estimated, without the LiDAR: for recordings, not for driving")
 
     def on_image(self, message: Any) -> None:
-        """Have the depth of an image computed if a keyframe could be taken of it."""
+        """Have the depth of an image computed if the image could become a keyframe."""
         image = held_image(message)
         if (back_s := self.chain.add_image(image, message)) > 0:
             self.log.warning("time went back by %.1f s: restarting", back_s)
         due = self.chain.due(image)
         if due and self.config.source == "lidar":
             self.handle(self.chain.hold(image))
-        elif due and not self.worker.busy and self.chain.request_due(image.stamp_ns):  # a keyframe may be on its way
+        elif (
+            due and not self.worker.busy and self.chain.request_due(image.stamp_ns)
+        ):  # else a keyframe may be on its way
             self.request.publish(header(image.frame, image.stamp_ns))
 
     def on_cloud(self, message: Any) -> None:
@@ -104,7 +106,7 @@ class DepthScalerNode(Node[DepthScalerConfig]):
             self.handle(held_image(message), image_array(message))
 
     def handle(self, image: HeldImage | None, raw: Floats | None = None) -> None:
-        """Compute the depth of an image and publish it; before that a completion corrects it in the background."""
+        """Compute the depth of an image and publish it, after a completion in the background if one is configured."""
         if image is None:
             return
         result = self.chain.estimate(raw, image)
@@ -116,7 +118,7 @@ class DepthScalerNode(Node[DepthScalerConfig]):
 
     def corrected(self, job: tuple[HeldImage, DepthResult, bytes]) -> tuple[HeldImage, DepthResult]:
         image, result, data = job
-        assert self.completion is not None  # without one no result has a prior
+        assert self.completion is not None  # only with a completion do results have a prior
         return image, complete(result, functools.partial(self.completion.complete, data))
 
     def publish_depth(self, done: tuple[HeldImage, DepthResult]) -> None:
@@ -132,7 +134,7 @@ class DepthScalerNode(Node[DepthScalerConfig]):
         text, level = f"keyframe {count}: {result.message}", OK if result.ok else WARN
         before = self.diagnoses().get("keyframe", (OK,))[0]
         self.diagnose("keyframe", level, text, id=count)
-        if level == before:  # else the diagnosis is in the log already
+        if level == before:  # a change of level is logged with the diagnosis
             self.log.info(text)
 
 

@@ -13,7 +13,7 @@ from instant_ic.util.paths import sign_in_file
 from instant_ic.util.web_access import AccessError, is_loopback, offer_sign_in
 
 _LOOK_S, _LEAST_S = 0.25, 0.02
-REFUSED_S = 10.0  # a refusal is a warning for this long
+REFUSED_S = 10.0  # time for which a refusal remains a warning
 
 
 class FoxgloveBridgeNode(Node[FoxgloveBridgeConfig]):
@@ -47,7 +47,7 @@ class FoxgloveBridgeNode(Node[FoxgloveBridgeConfig]):
         elif not local:
             self.diagnose("access", WARN, "token and data go over the network unencrypted; use a tunnel (ssh -L)")
         self._refused = RecentCount(REFUSED_S)
-        # A thread, not a timer: with simulated time the timers may stand still while messages already arrive.
+        # Use a thread, because timers on simulated time may stand still while messages already arrive.
         self._look_thread = threading.Thread(target=self._look, name="discovery", daemon=True)
         self._look_thread.start()
 

@@ -1,4 +1,4 @@
-"""Grid SLAM: from /scan and wheel odometry to /map, /pose and the transform map→odom."""
+"""Grid SLAM: computes /map, /pose and the transform map→odom from /scan and wheel odometry."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ from instant_ic.slam.scan_queue import QueuedScan, ScanError, ScanQueue
 from instant_ic.slam.start import make_slam, warm_up
 
 ODOMETRY_QUEUE = QoS("sensor", depth=100)
-"""Deep, because scans are placed between two odometry messages."""
-_POLL_S = 0.05  # odometry comes more often; where it does not, a scan is placed up to this much after its wait
+"""Long queue of odometry, because a scan is placed between two odometry messages."""
+_POLL_S = 0.05  # period at which waiting scans are checked if no odometry arrives
 
 
 class GridSlamNode(Node[GridSlamConfig]):
@@ -28,7 +28,7 @@ class GridSlamNode(Node[GridSlamConfig]):
     def setup(self) -> None:
         warm_up(self.config)
         self.commands = {"save": self.save}
-        self.poll: Any = None  # timer while scans wait for odometry, which may have gone silent
+        self.poll: Any = None  # timer while scans wait for odometry, which may have stopped
         self.worker = self.background(slam_messages.run_job, self.take_over)
         self.queue = ScanQueue(self.config)
         self.limiter = CorrectionLimiter()
@@ -36,7 +36,7 @@ class GridSlamNode(Node[GridSlamConfig]):
         self.pose_out = self.publisher("/pose", msg.PoseWithCovarianceStamped, qos=SENSOR)
         self.integrity_out = self.publisher("/slam/integrity", msg.PoseIntegrity, qos=SENSOR)
         self.restart()
-        # The laser's mount is fixed: /tf, which carries a message per odometry, is not needed.
+        # The laser's mount is fixed, so /tf, which carries a message per odometry, is not needed.
         self.mounts = TransformBuffer()
         self.subscribe("/tf_static", msg.TFMessage, lambda m: slam_messages.read_mounts(m, self.mounts), LATCHED)
         if self.config.use_wheel_odom:
@@ -57,7 +57,7 @@ class GridSlamNode(Node[GridSlamConfig]):
         config = self.config
         try:
             self.slam = make_slam(config, config.saved_map, config.mode == "localization")
-        except ValueError as error:  # MapError is one
+        except ValueError as error:  # includes MapError
             raise NodeError(str(error)) from None
         self.published_version = 0
         self.placed_ns: int | None = None
@@ -68,14 +68,14 @@ class GridSlamNode(Node[GridSlamConfig]):
         if self.queue.add_odometry(msg.stamp_ns(message), msg.pose2_from_message(message)):
             self.place_ready()
         else:
-            self.diagnose("odometry", WARN, "A message was dropped: not finite, or not newer than the last")
+            self.diagnose("odometry", WARN, "A message was dropped: it is not finite or not newer than the last")
 
     def on_scan(self, message: Any) -> None:
         now_ns = self.clock.now_ns()
         try:
             back_s = self.queue.check_stamp(msg.stamp_ns(message), now_ns)
             if back_s > 0:
-                self.diagnose("time", WARN, f"Time went back by {back_s:.1f} s. A new map begins")
+                self.diagnose("time", WARN, f"Time went back by {back_s:.1f} s. A new map has been started")
                 self.restart()
             scan, mount = slam_messages.read_scan(message, self.mounts)
             self.queue.add(scan, mount, now_ns, self.clock.steady_ns())
@@ -85,7 +85,7 @@ class GridSlamNode(Node[GridSlamConfig]):
         self.place_ready()
 
     def place_ready(self) -> None:
-        """Place the scans whose odometry has arrived or has been waited for long enough."""
+        """Place the scans whose odometry has arrived or whose waiting time is over."""
         for queued, odometry in self.queue.ready(self.clock.now_ns()):
             self.place(queued, odometry)
         if self.queue.waiting and self.poll is None:
@@ -95,7 +95,7 @@ class GridSlamNode(Node[GridSlamConfig]):
             self.poll = None
 
     def place(self, queued: QueuedScan, odometry: FloatArray | None) -> None:
-        """Call the library for one scan and publish the result."""
+        """Process one scan and publish the result."""
         config, slam, stamp = self.config, self.slam, queued.scan.stamp_ns
         result = slam.process(queued.scan, odometry, queued.base_from_laser)
         self.diagnose_all(*diagnoses(slam, result, odometry is not None, config.use_wheel_odom))
@@ -118,7 +118,7 @@ class GridSlamNode(Node[GridSlamConfig]):
             self.slam.take_over(result.outcome)
 
     def on_initial_pose(self, message: Any) -> None:
-        """Set the robot's pose in the saved map from outside (RViz's "2D pose estimate")."""
+        """Set the robot's pose in the saved map by hand, for example with RViz's "2D pose estimate"."""
         try:
             self.slam.set_pose(slam_messages.read_initial_pose(message))
             self.limiter.reset()
@@ -126,7 +126,7 @@ class GridSlamNode(Node[GridSlamConfig]):
             self.log.warning("/initialpose is not used: %s", error)
 
     def save(self, path: str) -> list[str]:
-        """Write the map to ``path``, without a suffix, and return the files; raises MapError, a ValueError."""
+        """Write the map to ``path``, which has no suffix, and return the files. Raise MapError if that fails."""
         files = [str(file) for file in self.slam.save(Path(path))]
         self.log.info("saved: %s", ", ".join(files))
         return files

@@ -113,13 +113,13 @@ class HostBridgeNode(Node[HostBridgeConfig]):
                 )
             case Failed():
                 self.log.error("%s", event.text)
-                self.stop()  # the launcher restarts it
+                self.stop()  # the launcher restarts the node
             case LinkProblem():
                 self.report.problem = event.text
                 self.update()
 
     def holder(self) -> str:
-        """Who has the robot's lease; empty: nobody, or the arbiter is silent. Any thread may call it."""
+        """Return the holder of the robot's lease; empty if there is none or /ic/state is stale. Any thread may call."""
         state = None if self.state is None else self.state.message
         return "" if state is None else str(state.holder)
 

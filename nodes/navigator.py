@@ -27,10 +27,10 @@ class NavigatorConfig(Checked):
 
     Attributes:
         controller_frequency: commands per second.
-        replan_period_s: s between plans.
-        subgoal_timeout_s: s; with an older subgoal the robot stands.
-        costmap_timeout_s: s; with an older costmap the robot stands.
-        state_timeout_s: s; with an older /ic/state nothing is published.
+        replan_period_s: s; time between two plans.
+        subgoal_timeout_s: s; age of the subgoal above which the robot stands.
+        costmap_timeout_s: s; age of the costmap above which the robot stands.
+        state_timeout_s: s; age of /ic/state above which nothing is published.
     """
 
     controller_frequency: Annotated[float, Plausible(2, 200)] = 20.0
@@ -44,7 +44,7 @@ class NavigatorConfig(Checked):
 
 
 PRESENT_S = 0.2
-"""Period of the zeros at rest: by them the arbiter notices a restart in every mode."""
+"""Period of zero commands at rest, by which the arbiter notices a restart of this node in every mode."""
 
 
 class NavigatorNode(Node[NavigatorConfig]):
@@ -60,7 +60,7 @@ class NavigatorNode(Node[NavigatorConfig]):
         c = self.config
         self.navigator = self.made(c)
         self.speed = 0.0
-        self.grid: tuple[Any, Any] = (None, None)  # the newest costmap's message, and the costmap
+        self.grid: tuple[Any, Any] = (None, None)  # newest costmap, as message and as converted
         self.follow_timer: Any = None  # runs while the operator drives the v-bot
         self.gap = StepGap()
         self.cmd_vel = self.publisher("/nav/cmd_vel", msg.TwistStamped, qos=SENSOR)
@@ -77,10 +77,10 @@ class NavigatorNode(Node[NavigatorConfig]):
 
     def reconfigure(self, config: NavigatorConfig) -> None:
         super().reconfigure(config)
-        self.navigator = self.made(config)  # plans again at once
+        self.navigator = self.made(config)  # which plans again at once
 
     def on_state(self, state: msg.ControlState) -> None:
-        """Follow at the controller's rate while the operator drives the v-bot; otherwise rest."""
+        """Follow at the controller's rate while the operator drives the v-bot. Otherwise, rest."""
         if state.mode != Mode.VIRTUAL:
             self.rest()
         elif self.follow_timer is None:
@@ -113,11 +113,11 @@ class NavigatorNode(Node[NavigatorConfig]):
         self.cmd_vel.publish(msg.twist_stamped(*command, self.clock.now_ns()))
 
     def command(self, state: msg.ControlState) -> tuple[float, float]:
-        """Return the twist for the r-bot; zero, with a diagnosis, while an input is missing."""
+        """Return the twist for the r-bot. While an input is missing, diagnose it and return zero."""
         grid, goal = self.costmap.fresh, self.subgoal.fresh
         if grid is None or goal is None:
             missing = "costmap" if grid is None else "subgoal"
-            self.diagnose("follow", WARN, f"No {missing} within its time-out. The robot stands")
+            self.diagnose("follow", WARN, f"The {missing} has timed out. The robot stands")
             return 0.0, 0.0
         age_s = (self.clock.now_ns() - msg.stamp_ns(state)) / 1e9
         pose = extrapolate(msg.pose2_from_message(state.robot_pose), msg.twist_values(state.robot_twist), age_s)

@@ -26,7 +26,7 @@ from instant_ic.vspace.prior import load_robot_mask
 from instant_ic.vspace.worker import EncodedView, IncomingKeyframe, Job, SpaceWorker, Turns, ViewOrder
 
 _STATUS_S = 0.5
-_LOCKSTEP_S, _LOCKSTEP_ITERATIONS = 0.1, 5  # in tests and replay training runs by iterations, not by time
+_LOCKSTEP_S, _LOCKSTEP_ITERATIONS = 0.1, 5  # in tests and replay, training is limited by iterations, not by time
 
 
 class NerfNode(Node[NerfConfig]):

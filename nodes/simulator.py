@@ -1,4 +1,4 @@
-"""Simulated robot in a simulated world: its devices with their real protocols, and ground truth for evaluation."""
+"""Simulates the robot in a world: its devices with their real protocols, and ground truth for evaluation."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _LATE_S = 0.2
 
 
 class SimulatorNode(Node[SimulatorConfig]):
-    """One process with the robot, its three devices and the ground truth."""
+    """Runs the simulated robot with its three devices, and publishes the ground truth."""
 
     name = "simulator"
 
@@ -52,11 +52,11 @@ class SimulatorNode(Node[SimulatorConfig]):
         self.timer(1.0, self._check)
 
     def teardown(self) -> None:
-        if hasattr(self, "_open"):  # else the node failed before its setup
+        if hasattr(self, "_open"):  # else the node has failed before its setup
             self._open.close()
 
     def _put_down(self, message: PoseStamped) -> None:
-        """Lift the robot and put it down elsewhere in the world."""
+        """Put the robot down elsewhere in the world."""
         try:
             x, y, yaw = (float(v) for v in pose2_from_message(message))
             self.simulation.put_down((x, y, yaw))
@@ -72,13 +72,13 @@ class SimulatorNode(Node[SimulatorConfig]):
         contact = (robot.contact, robot.contacts)
         if contact != self._published:
             if robot.contacts > self._published[1] and not robot.contact:
-                # The contact began and ended between two ticks: report it too.
+                # Report a contact that began and ended between two ticks too.
                 self.contact.publish(Bool(data=True))
             self._published = contact
             self.contact.publish(Bool(data=robot.contact))
 
     def _publish_late(self) -> None:
-        """Publish the devices' delay as a share of the acceptable one; above 1 the launcher slows the stack."""
+        """Publish the devices' delay as a share of the acceptable delay. Above 1, the launcher slows the stack."""
         camera = self._devices.camera
         camera_s = camera.late_s if camera is not None else 0.0
         self.late.publish(Float32(max(self._loop.take_lag_s() / ACCEPTABLE_LAG_S, camera_s / ACCEPTABLE_DELAY_S)))
@@ -86,7 +86,7 @@ class SimulatorNode(Node[SimulatorConfig]):
     def _check(self) -> None:
         loop, robot = self._loop, self.simulation.robot
         if (fault := loop.fault) is not None:
-            text = f"the simulation stopped: {type(fault).__name__}: {fault}; restart it"
+            text = f"the simulation has stopped ({type(fault).__name__}: {fault}): restart it"
             self.diagnose("simulation", ERROR, text)
             return
         level, text = (WARN, "the robot pushes against something") if robot.contact else (OK, "free")

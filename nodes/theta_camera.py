@@ -56,7 +56,7 @@ class ThetaCameraNode(Node[ThetaCameraConfig]):
         self.broadcast_mount()
 
     def play_files(self, camera: FileCamera) -> None:
-        """Play files on the node's own timer; devices have their own time."""
+        """Play files on the node's timer."""
         try:
             self.on_event(True, camera.connect())
         except CameraError as error:
@@ -64,7 +64,7 @@ class ThetaCameraNode(Node[ThetaCameraConfig]):
         self.timer(1.0 / self.config.files.rate_hz, lambda: self.publish(camera.read()))
 
     def on_frame(self, frame: Frame) -> None:
-        """Publish a device's image unless it is a copy or empty, on the camera's thread. Video files may repeat."""
+        """Publish a device's image on the camera's thread, unless it is a copy or empty. Video files may repeat."""
         if self.camera.recorded or self.images.is_live(frame):
             self.publish(frame)
 
@@ -80,7 +80,7 @@ class ThetaCameraNode(Node[ThetaCameraConfig]):
         self.diagnose("camera", level, f"{text}. {advice}" if advice else text)
 
     def check(self) -> None:
-        """Report silence and the frame rate; each second."""
+        """Report missing images and the frame rate, each second."""
         silent_s = (self.clock.steady_ns() - self.last_ns) * 1e-9
         values = {
             "images": self.published,

@@ -1,4 +1,4 @@
-"""The robot that the operator drives in the virtual space; in REAL it stays at the r-bot's pose."""
+"""Moves the v-bot, which the operator drives in the virtual space. In REAL, it stays at the r-bot's pose."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class VirtualRobotConfig(Checked):
 
     Attributes:
         rate_hz: steps and messages on /vbot/odom, per second.
-        state_timeout_s: s without /ic/state after which the v-bot stands still.
+        state_timeout_s: s; time without /ic/state after which the v-bot stands.
     """
 
     rate_hz: Annotated[float, Plausible(2, 200)] = 20.0
@@ -61,7 +61,7 @@ class VirtualRobotNode(Node[VirtualRobotConfig]):
         self.state.max_age_s = config.state_timeout_s
 
     def on_state(self, message: msg.ControlState) -> None:
-        """Obey a changed command at once; the arbiter has it from the one operator who has the robot's lease."""
+        """Obey a changed command of the lease's holder, which the arbiter reports, at once."""
         if self.action == VbotAction.DRIVEN and self.times.command_steps(msg.twist_values(message.operator_command)):
             self.tick()
 
@@ -81,22 +81,22 @@ class VirtualRobotNode(Node[VirtualRobotConfig]):
             self.diagnose("state", WARN, "The arbiter does not report. The v-bot stands")
             self.robot.place(self.robot.pose, (0.0, 0.0))
             if self.action is None:
-                return  # no pose yet
+                return  # there is no pose to publish yet
         else:
             self.obey(state, dt_s)
         pose = matrix_from_pose2(self.robot.pose)
         self.odom.publish(msg.odometry_message(pose, *self.robot.velocity, "map", "vbot_base_link", now_ns))
 
     def obey(self, state: msg.ControlState, dt_s: float) -> None:
-        """Act as the arbiter's state demands."""
+        """Move the v-bot by the action in the arbiter's state."""
         action, before, self.action = VbotAction(state.vbot_action), self.action, VbotAction(state.vbot_action)
         robot_pose = msg.pose2_from_message(state.robot_pose)
         robot_twist = msg.twist_values(state.robot_twist)
         age_s = (self.clock.now_ns() - msg.stamp_ns(state)) / 1e9
-        # The arbiter's message is up to a period old, and the r-bot moves on.
+        # The arbiter's message is up to a period old, and the r-bot has moved since.
         target = extrapolate(msg.pose2_from_message(state.vbot_target), robot_twist, age_s)
         if before is None and action != VbotAction.WITH_ROBOT:
-            self.robot.place(msg.pose2_from_message(state.vbot_pose), (0.0, 0.0))  # the node was restarted
+            self.robot.place(msg.pose2_from_message(state.vbot_pose), (0.0, 0.0))  # this node was restarted
         if action == VbotAction.WITH_ROBOT:
             self.robot.place(target, robot_twist)
         elif action == VbotAction.DRIVEN:

@@ -1,4 +1,4 @@
-"""Converts the VLP-16's packets, from the network, a capture or a bag, to point clouds and flat scans."""
+"""Converts VLP-16 packets from the network, a capture or a bag to point clouds and flat scans."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from instant_ic.lidar.stream import Revolution
 from instant_ic.msg import LaserScan, PointCloud2, VelodyneScan, cloud_message, stamp_ns
 
 _MAX_WAITING = 5
-"""Revolutions that may wait for the node's thread; with more the machine is too slow for the sensor."""
+"""Number of revolutions that may wait for the node's thread. With more, the machine is too slow for the sensor."""
 
 
 class Vlp16DriverNode(Node[Vlp16DriverConfig]):
@@ -41,7 +41,7 @@ class Vlp16DriverNode(Node[Vlp16DriverConfig]):
         except ValueError as error:
             raise NodeError(str(error)) from None
         self.transforms.broadcast_static("base_link", config.frame_id, self.base_from_lidar)
-        self.tf.frames()  # listens to odometry from here on
+        self.tf.frames()  # starts listening to odometry
         self.points = self.publisher("/lidar/points", PointCloud2, qos=SENSOR)
         self.scan = self.publisher("/scan", LaserScan, qos=SENSOR)
         self.packets = self.publisher("/lidar/packets", VelodyneScan, qos=SENSOR) if config.source != "topic" else None
@@ -94,14 +94,14 @@ class Vlp16DriverNode(Node[Vlp16DriverConfig]):
             self.open_capture()
 
     def on_datagram(self, received: SensorDatagram) -> None:
-        """Take a datagram, on whichever thread it arrives."""
+        """Take a datagram on the thread on which it arrives."""
         if received.is_data:
             self.take(received.payload, received.stamp_ns)
         else:
             self.call_soon(self.diagnose_all, self.report.position(received.payload))
 
     def take(self, payload: bytes, stamp: int) -> None:
-        """Take one data packet, on whichever thread packets arrive."""
+        """Take one data packet on the thread on which it arrives."""
         done = self.feed.take(payload, stamp, self.clock.steady_ns())
         if done is not None:
             self.hand_on(*done)
@@ -133,7 +133,7 @@ class Vlp16DriverNode(Node[Vlp16DriverConfig]):
             self.scan.publish(flat_scan_message(self.cover.withhold(ranges), revolution, config))
 
     def check(self) -> None:
-        """Report silence and losses; each second."""
+        """Report missing and lost data, each second."""
         config = self.config
         where = f"{config.host}:{self.receiver.port}" if self.receiver is not None else config.pcap
         self.diagnose_all(*self.report.check(self.clock.steady_ns(), config.silence_s, config.source, where))

@@ -34,7 +34,7 @@ class ZenohGatewayConfig:
     """Parameters.
 
     Attributes:
-        namespace: the robot's name in the fleet; ``/scan`` here is ``/robot1/scan`` there. Empty: names stay.
+        namespace: name of the robot in the fleet, so that ``/scan`` here is ``/robot1/scan`` there; empty keeps names.
         domain: ROS domain (``ROS_DOMAIN_ID``).
         mode: peer joins through a router on this host, as rmw_zenoh does; client connects to a router elsewhere.
         connect: routers to connect to; empty: tcp/localhost:7447, or the routers of the session file.
@@ -43,8 +43,8 @@ class ZenohGatewayConfig:
         subscribe: topics to receive, names or patterns.
         commands: operators' commands to accept: /operator/cmd_vel, /operator/estop. Only over TLS with certificates on
             both sides (session_file). Without TLS, only pressing the emergency stop is accepted.
-        insecure_loopback_commands: accept commands without TLS where every link stays within this machine, as in a
-            simulation; anybody who can run a program on it can then drive. Refused beside a real base.
+        insecure_loopback_commands: accept commands without TLS if every link stays within this machine, as in a
+            simulation. Anybody who can run a program on it can then drive. Refused beside a real base.
         unprotected: allow ``insecure_loopback_commands`` beside a real base, with a permanent warning.
         limits: limits on the commands.
     """
@@ -107,7 +107,7 @@ class ZenohGatewayNode(Node[ZenohGatewayConfig]):
                 self.connect(RosSession(self._zenoh, config.domain))
         except ZenohError as error:
             raise NodeError(str(error)) from None
-        if self.session is None:  # a client's router may start later
+        if self.session is None:  # the router may start later
             self._opener = self.background(self.open, self.opened)
             self._opener.submit(None)
             self.timer(RETRY_S, self.try_again)
@@ -115,7 +115,7 @@ class ZenohGatewayNode(Node[ZenohGatewayConfig]):
         self.timer(1.0, self.report)
 
     def open(self, _: None) -> RosSession | ZenohError:
-        """Try to reach the router (background thread)."""
+        """Try to reach the router, on a background thread."""
         try:
             return RosSession(self._zenoh, self.config.domain)
         except ZenohError as error:

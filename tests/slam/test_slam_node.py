@@ -193,7 +193,7 @@ def test_time_that_goes_far_back_begins_a_new_map() -> None:
     rig.wheel()
     rig.scan()
     assert len(rig.node.slam.front_end.trajectory) == 1
-    assert "A new map begins" in rig.node.diagnoses()["time"][1]
+    assert "A new map has been started" in rig.node.diagnoses()["time"][1]
 
 
 def test_two_runs_are_the_same_bit_for_bit() -> None:
