@@ -1,4 +1,4 @@
-"""360° depth at run time: ONNX inference, the scaling by LiDAR, depth from LiDAR, and the fusion of both.
+"""360° depth at run time: ONNX inference, scaling by LiDAR, depth from LiDAR, and the fusion of both.
 
-Nothing heavy is imported here: ``model`` needs onnxruntime, ``metrics`` and ``scaler`` need only numpy.
+This package imports nothing heavy: ``model`` needs onnxruntime, ``metrics`` and ``scaler`` need only numpy.
 """

@@ -1,4 +1,4 @@
-"""From images, LiDAR revolutions and the network's depth to metric depth and keyframes."""
+"""Processing of images, LiDAR revolutions and the network's depth to metric depth and keyframes."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from instant_ic.util.diagnosis import Level
 
 _MAX_IMAGES, _MAX_REVOLUTIONS = 150, 40
 _SILENT_S = 10.0
-"""The node warns after this time without an answer to any request."""
+"""Seconds without an answer to any request after which the node warns."""
 
 
 @dataclass(frozen=True)
@@ -31,14 +31,14 @@ class DepthScalerConfig(SourceConfig):
     """Parameters of the node ``depth_scaler``.
 
     Attributes:
-        completion: completion model for ``completed``: ONNX file; a bare name is searched for in ``models/``.
+        completion: ONNX file of the completion model for ``completed``; a bare name is searched for in ``models/``.
         provider, threads: execution provider and CPU threads of the completion.
         keyframes: selection of keyframes.
-        mapping: the local 3D model, from which all sources but ``network`` take depth first.
-        max_rate_hz: highest rate of the source ``lidar``, by the images' stamps; that of the others is
-            depth_estimator's.
-        rows: height of the depth image of source ``lidar``; the others have the network's.
-        body_elevation_deg: below this elevation the image shows the robot itself, not the room; -90: nowhere.
+        mapping: the local 3D model, from which all sources except ``network`` take depth first.
+        max_rate_hz: highest rate of the source ``lidar``, by the images' stamps; depth_estimator sets the rate of the
+            other sources.
+        rows: height of the depth image of source ``lidar``; the network sets the height of the other sources.
+        body_elevation_deg: degrees; pixels below this elevation show the robot itself; -90: none.
     """
 
     source: str = "completed"
@@ -54,11 +54,11 @@ class DepthScalerConfig(SourceConfig):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.source == "completed" and not self.completion:
-            raise ValueError("source completed needs a model: set completion to a file of ic depth train --export")
+            raise ValueError("source completed needs a model; set completion to a file of ic depth train --export")
 
 
 class DepthChain:
-    """Keeps recent inputs, computes the depth of images that may become keyframes, and selects the keyframes.
+    """Chain from recent images and points to keyframes: depth of possible keyframes, and selection among them.
 
     Args:
         config: parameters.
@@ -87,7 +87,7 @@ class DepthChain:
         self._last_ns: int | None = None  # stamp of the newest depth
 
     def reconfigure(self, config: DepthScalerConfig) -> None:
-        """Apply new parameters; the local model starts again if they change it."""
+        """Apply new parameters. If those of the local model change, the local model starts again."""
         before, self.config, self.selector.config = self.config, config, config.keyframes
         self.source.configure(config)
         if before.mapping != config.mapping:
@@ -97,7 +97,7 @@ class DepthChain:
             self.adopt(*self._model)
 
     def adopt(self, name: str, output_kind: str) -> None:
-        """Adopt the kind of values that the network reports, whatever the configuration says."""
+        """Use the kind of values that the network reports instead of the configured kind."""
         self._model = name, output_kind
         try:
             scaler = replace(self.config.scaler, output_kind=output_kind)
@@ -107,7 +107,7 @@ class DepthChain:
         self._diagnose("model", Level.OK, f"{name}: {output_kind} depth")
 
     def add_image(self, image: HeldImage, message: Any) -> float:
-        """Keep an image; return the seconds by which time went back. Above 0, the keyframes start again."""
+        """Keep an image; return the seconds by which time jumped back, or 0. After a jump, keyframes start again."""
         back_s = (self.image_ns - image.stamp_ns) / 1e9
         if restarts := image.stamp_ns < self.image_ns - KEEP_NS:
             self.selector.restart()
@@ -115,7 +115,7 @@ class DepthChain:
         self.images[image.stamp_ns] = message
         if len(self.images) > _MAX_IMAGES:
             del self.images[next(iter(self.images))]
-        # Inputs from the future are discarded too: the clock may have gone back.
+        # Inputs from the future are discarded too, because the clock may have been set back.
         kept_ns = self.requests.since_ns or image.stamp_ns
         for old in [other for other in self.images if abs(other - kept_ns) > KEEP_NS]:
             del self.images[old]
@@ -124,7 +124,7 @@ class DepthChain:
         return back_s if restarts else 0.0
 
     def due(self, image: HeldImage) -> bool:
-        """Return whether a keyframe could be taken of the image."""
+        """Return whether the image may become a keyframe."""
         try:
             due = self.selector.due(self.map_from_camera(image), image.stamp_ns)
         except TransformError as error:
@@ -134,7 +134,7 @@ class DepthChain:
         return due
 
     def hold(self, image: HeldImage) -> HeldImage | None:
-        """Hold an image until the revolution around it is complete; return an earlier one that got none."""
+        """Hold an image until the revolution around it is complete; return an earlier one whose revolution is late."""
         return self._trigger.image(image, self._last_ns, self.config.max_rate_hz)
 
     def request_due(self, stamp_ns: int) -> bool:
@@ -143,8 +143,8 @@ class DepthChain:
             return False
         silent_s = (stamp_ns - (self.requests.since_ns or stamp_ns)) / 1e9
         if silent_s > _SILENT_S:
-            text = "does depth_estimator run? source lidar needs none"
-            self._diagnose("scale", Level.WARN, f"no /depth/raw for {silent_s:.0f} s: {text}")
+            text = "check that depth_estimator runs, or set source to lidar"
+            self._diagnose("scale", Level.WARN, f"no /depth/raw for {silent_s:.0f} s; {text}")
         return True
 
     def add_revolution(self, revolution: TimedPoints) -> HeldImage | None:
@@ -160,7 +160,7 @@ class DepthChain:
         return self._trigger.revolution(revolution.middle_ns)
 
     def estimate(self, raw: NDArray[np.float32] | None, image: HeldImage) -> DepthResult:
-        """Estimate the depth of an image; without poses or points the result is not ok, and its message says why.
+        """Estimate the depth of an image. Without poses or points the result is not ok, and its message says why.
 
         Args:
             raw: the network's depth, (H, W); None for the source ``lidar``.
@@ -170,7 +170,7 @@ class DepthChain:
         try:
             up, height_m = self._camera_stance(image)
             if raw is not None and self.source.config.scaler.method == "as_estimated":
-                # Not masked: a camera at another place has another height.
+                # The robot is not masked, because the camera may be elsewhere and have another height.
                 return self.source.estimate(raw, np.empty((0, 3)), up, height_m, size=size)
             points, local = self._points_in_camera(image), None
             if self.source.config.source != "network":
@@ -183,13 +183,13 @@ class DepthChain:
         return without_body(result, up, height_m, self.config.body_elevation_deg)
 
     def _camera_stance(self, image: HeldImage) -> tuple[NDArray[np.float64], float]:
-        """Return the up direction in the camera's frame (odometry is level) and the camera's height over the ground."""
+        """Return the up direction in the camera's frame and the camera's height over the ground; odometry is level."""
         base_from_camera = self._transforms.lookup("base_link", image.frame, image.stamp_ns)
         odom_from_camera = self._transforms.lookup("odom", image.frame, image.stamp_ns)
         return np.array(odom_from_camera[2, :3]), float(base_from_camera[2, 3])
 
     def _points_in_camera(self, image: HeldImage) -> NDArray[np.float64] | None:
-        """Return the nearest revolution in the camera's frame, motion-compensated, (N, 3); None without one."""
+        """Return the nearest revolution's points (N, 3) in the camera's frame, motion-compensated; None if missing."""
 
         def gap_ns(revolution: TimedPoints) -> int:
             return abs(revolution.middle_ns - image.stamp_ns)
@@ -207,7 +207,7 @@ class DepthChain:
     def map_from_camera(self, image: HeldImage) -> Matrix:
         """Return the camera's pose from odometry and its correction at the image's time.
 
-        Tracks slip in a turn: one second later the correction differs by degrees.
+        The correction must be that of the image's time. Tracks slip in a turn, so it changes by degrees in a second.
 
         Raises:
             TransformError: the poses are not known.

@@ -1,4 +1,4 @@
-"""Input of depth completion: the fused depth that the network corrects."""
+"""Input of depth completion, made of the fused depth that the network corrects."""
 
 from __future__ import annotations
 
@@ -10,25 +10,25 @@ from instant_ic.geometry.projections import rays_of
 Floats = NDArray[np.floating]
 PRIOR_CHANNELS = 6
 _AGREE, _AGREE_M = 0.02, 0.02
-"""A point is trusted where it differs by less than this share and this length from the depth built of all points."""
+"""Largest difference of a trusted point from the depth built of all points: share of the depth, and metres."""
 _MOST_M = 40.0
 
 
 def prior_channels(
     depth_m: Floats, sigma: Floats, ranges_m: Floats, up: Floats, camera_height_m: float | None, network_m: Floats
 ) -> NDArray[np.float32]:
-    """Build the channels (6, H, W) that a completion network takes beside the image.
+    """Build the channels (6, H, W) that a completion network receives besides the image.
 
     Args:
-        depth_m: (H, W) fused radial metres, 0 = unknown.
-        sigma: (H, W) its relative standard deviation.
-        ranges_m: (H, W) range of the confirmed point in each pixel, 0 without one.
-        up: (3,) gravity's up in the camera's frame.
-        camera_height_m: height of the camera over the floor; None if it is unknown.
-        network_m: (H, W) depth of the network that sees the image alone, scaled and corrected by points, 0 = unknown.
+        depth_m: fused radial depth in metres, (H, W); 0 is unknown.
+        sigma: relative standard deviation of ``depth_m``, (H, W).
+        ranges_m: range of the confirmed point in each pixel in metres, (H, W); 0 if there is no point.
+        up: up direction (against gravity) in the camera's frame, (3,).
+        camera_height_m: height of the camera over the floor; None if unknown.
+        network_m: depth of the network that uses only the image, scaled and corrected by points, (H, W); 0 is unknown.
 
     Returns:
-        ``depth``; ``sigma`` (0 where unknown); ``measured``: 1 at trusted points, where the output is the input;
+        ``depth``; ``sigma`` (0 where unknown); ``measured``: 1 at trusted points, where the output equals the input;
         ``rise``: sine of the pixel's elevation; ``floor``: distance of a level floor, 0 above the horizon; ``network``.
     """
     depth = np.where((depth_m > 0) & (depth_m < _MOST_M), depth_m, 0).astype(np.float32)

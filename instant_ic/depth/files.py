@@ -1,6 +1,6 @@
-"""Images and depth from files.
+"""Loading of images and depth from files.
 
-Depth as PNG of 16 bits (millimetres), ``.npy`` and ``.npz`` (key ``depth``), both in metres.
+Depth files are 16-bit PNGs in millimetres, or ``.npy`` and ``.npz`` (key ``depth``) in metres.
 """
 
 from __future__ import annotations
@@ -17,18 +17,18 @@ from instant_ic.util.limits import check_arrays, load_image
 DEPTH_SUFFIXES = (".png", ".npy", ".npz")
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp")
 _BEYOND_M = 1e4
-"""Renderers write such values (inf, 1e10) where a ray meets nothing."""
+"""Depth from which a value is unknown, because renderers write inf or 1e10 where a ray hits nothing."""
 
 
 class DepthFileError(ValueError):
-    """A file holds no depth or no image; the message names the file and the reason."""
+    """A file contains no depth or no image; the message names the file and the reason."""
 
 
 def load_rgb(path: str | Path) -> NDArray[np.uint8]:
     """Load an image as (H, W, 3) uint8 RGB.
 
     Raises:
-        DepthFileError: missing, or no image.
+        DepthFileError: the file is missing, or not an image.
     """
     import cv2
 
@@ -40,20 +40,19 @@ def load_rgb(path: str | Path) -> NDArray[np.uint8]:
 
 
 def load_depth(path: str | Path, png_unit_m: float = 1e-3) -> NDArray[np.float32]:
-    """Load depth in metres, (H, W) float32. Values that are not finite, not above 0 or above 10 km become 0, unknown.
+    """Load depth in metres, (H, W) float32. Values that are not finite, negative or above 10 km become 0 (unknown).
 
     Args:
         path: the file.
-        png_unit_m: metres per unit of a PNG (Stanford 2D-3D-S: 1/512, Matterport3D: 1/4000). Its largest value, 65535,
-            is unknown.
+        png_unit_m: metres per unit of a PNG (Stanford 2D-3D-S: 1/512, Matterport3D: 1/4000); 65535 is unknown.
 
     Raises:
-        DepthFileError: missing, damaged, of another kind or shape, or without any known depth.
+        DepthFileError: the file is missing, damaged, of another kind or shape, or has no known depth.
     """
     path = Path(path)
     kind = path.suffix.lower()
     if kind not in DEPTH_SUFFIXES:
-        raise DepthFileError(f"{path}: depth is read from {', '.join(DEPTH_SUFFIXES)}, not {kind or 'a bare name'!r}")
+        raise DepthFileError(f"{path}: depth files must be {', '.join(DEPTH_SUFFIXES)} (got {kind or 'no suffix'!r})")
     _check_readable(path)
     values = _png(path, png_unit_m) if kind == ".png" else _numpy(path)
     values = np.squeeze(values) if values.ndim == 3 and 1 in values.shape else values
@@ -62,7 +61,7 @@ def load_depth(path: str | Path, png_unit_m: float = 1e-3) -> NDArray[np.float32
     values = values.astype(np.float32)
     values[~(np.isfinite(values) & (values > 0) & (values < _BEYOND_M))] = 0  # NaN compares false
     if not values.any():
-        raise DepthFileError(f"{path}: no known depth in it: all values are 0, negative or not finite")
+        raise DepthFileError(f"{path}: no known depth; all values are 0, negative or not finite")
     return values
 
 
@@ -85,8 +84,8 @@ def _png(path: Path, unit_m: float) -> NDArray[Any]:
     if values.dtype != np.uint16 or values.ndim != 2:
         channels = 1 if values.ndim == 2 else values.shape[2]
         raise DepthFileError(
-            f"{path}: depth as PNG has one channel of 16 bits "
-            f"(got {channels} of {8 * values.dtype.itemsize} bits: an image of depth?)"
+            f"{path}: a depth PNG must have one channel of 16 bits "
+            f"(got {channels} of {8 * values.dtype.itemsize} bits; perhaps a coloured image of depth)"
         )
     return np.where(values < 65535, values * np.float32(unit_m), np.float32(0))
 
@@ -106,5 +105,5 @@ def _numpy(path: Path) -> NDArray[Any]:
     except (OSError, ValueError, EOFError, MemoryError, zipfile.BadZipFile) as error:
         raise DepthFileError(f"{path}: not a readable numpy file: {error}") from error
     if not isinstance(loaded, np.ndarray) or loaded.dtype.kind not in "fiu":
-        raise DepthFileError(f"{path}: must hold an array of numbers, metres (got {getattr(loaded, 'dtype', 'none')})")
+        raise DepthFileError(f"{path}: must be an array of numbers in metres (got {getattr(loaded, 'dtype', 'none')})")
     return loaded

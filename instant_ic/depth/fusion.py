@@ -1,4 +1,4 @@
-"""The network's depth, corrected by LiDAR points, and the ceiling that it shows."""
+"""Correction of the network's depth by LiDAR points, and the ceiling's height from the network."""
 
 from __future__ import annotations
 
@@ -12,24 +12,24 @@ Floats = NDArray[np.floating]
 
 
 _ACROSS_DEG, _ALONG_DEG = 6.0, 25.0
-"""How far around a point, in azimuth and elevation, the network is corrected by it: it is wrong by the same factor over
-the height of a wall rather than along it."""
+"""Standard deviations of a point's influence on the network, in azimuth and elevation. The larger one is vertical,
+because the network's error factor varies less over the height of a wall than along it."""
 
 
 def ceiling_height(depth_m: Floats, rise: Floats, least_m: float = 0.3) -> float | None:
-    """Return the height over the camera, in metres, at which most of the upper part of a depth image lies.
+    """Return the ceiling's height over the camera: the most frequent height in the upper part of a depth image.
 
     Args:
-        depth_m: (H, W) radial metres, 0 = unknown.
-        rise: (H, W) sine of each pixel's elevation over the horizon.
+        depth_m: radial depth in metres, (H, W); 0 is unknown.
+        rise: sine of each pixel's elevation over the horizon, (H, W).
         least_m: lowest height of a ceiling.
 
     Returns:
-        None where no level surface stands out.
+        The height in metres; None if no level surface stands out.
     """
     upper = (rise > 0.35) & (depth_m > 0)
     sine = np.minimum(rise[upper], 1.0)
-    height, weight = depth_m[upper] * sine, np.sqrt(1 - sine**2)  # a pixel's solid angle
+    height, weight = depth_m[upper] * sine, np.sqrt(1 - sine**2)  # weight by the pixel's solid angle
     usable = (height > least_m) & (height < 12)
     if usable.sum() < 100:
         return None
@@ -48,9 +48,9 @@ class Corrected:
     """A network's depth, corrected by points.
 
     Attributes:
-        depth_m: (H, W) metres, 0 = unknown.
-        wrong: (H, W) share of the points around each pixel that are still plainly off.
-        sigma: relative standard deviation at the points that are not.
+        depth_m: radial depth in metres, (H, W); 0 is unknown.
+        wrong: share of the points around each pixel at which the depth is still grossly wrong, (H, W).
+        sigma: relative standard deviation of the depth at the other points.
     """
 
     depth_m: NDArray[np.float32]
@@ -59,10 +59,10 @@ class Corrected:
 
 
 def correct(network_m: Floats, measured_m: Floats) -> Corrected:
-    """Correct scaled network depth (H, W) by a smooth field of factors from ranges (H, W), 0 where there is none.
+    """Correct scaled network depth (H, W) by a smooth field of factors from ranges (H, W), which are 0 without a point.
 
-    The field is the weighted mean of the log ratios over a Gaussian around each pixel; far from any point it is 1. It
-    is computed twice: the second time, ratios far from the first field count little.
+    The logarithm of the field is the mean of the log ratios, weighted by a Gaussian around each pixel. Far from any
+    point the factor is 1. In a second pass, ratios that differ much from the first field have little weight.
     """
     height, width = network_m.shape
     seen = (measured_m > 0) & (network_m > 0)
@@ -101,8 +101,8 @@ def correct(network_m: Floats, measured_m: Floats) -> Corrected:
 def likely_ceiling(seen_m: float, network: Corrected, usual_m: float) -> float:
     """Estimate a ceiling's height over the camera in metres from the network's depth and the usual height.
 
-    Ceilings vary by a fifth around the usual one; a network's is off by about as much as it is at the points, and by
-    a third of the share that is plainly wrong there (measured on simulated rooms).
+    Ceilings vary by a fifth around the usual height. The network's ceiling has about the same relative error as its
+    depth at the points, plus a third of the share of grossly wrong points (measured on simulated rooms).
     """
     variance = 0.02**2 + network.sigma**2 + (0.3 * float(network.wrong.mean())) ** 2
     share = variance / (variance + 0.22**2)

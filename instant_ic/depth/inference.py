@@ -1,4 +1,4 @@
-"""Runs a depth model on encoded images: with a time-out, and on the CPU after a faster provider has failed."""
+"""Inference of a depth model on encoded images, with a time-out and a fallback to the CPU."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ Result = TypeVar("Result")
 Floats = NDArray[np.float32]
 
 _CANCELLATIONS = 20
-_GIVE_UP_S = 10.0  # an inference still running this long after its cancellation hangs in a driver
+_GIVE_UP_S = 10.0  # an inference that runs this long after its cancellation hangs in a driver
 logger = logging.getLogger("instant_ic.depth")
 
 
@@ -29,8 +29,8 @@ class Inference:
 
     Args:
         name, provider, threads: as in ``DepthModel.find``.
-        on_hang: called when an inference does not end after its cancellation; only a new process helps then.
-        timeout_s: an inference that takes longer is cancelled; may be changed at any time.
+        on_hang: called if an inference does not end after its cancellation, because only a new process helps then.
+        timeout_s: time after which an inference is cancelled; may be changed at any time.
 
     Raises:
         ManifestError, FileNotFoundError: the model cannot be used.
@@ -44,32 +44,32 @@ class Inference:
         self._load(provider)
 
     def _load(self, provider: str) -> None:
-        """Load the model; report its provider."""
+        """Load the model, and log its provider."""
         self.model = model = DepthModel.find(self._name, self._threads, provider)
         manifest = model.manifest
         kind = f"{manifest.output_kind}, {manifest.input_width}x{manifest.input_height}"
         logger.info("%s (%s) on %s", manifest.name, kind, model.provider)
         if provider not in ("auto", model.provider):
             why = "see onnxruntime's messages, or: pip install onnxruntime-gpu instead of onnxruntime"
-            logger.warning("provider %s was requested, the model runs on %s (%s)", provider, model.provider, why)
+            logger.warning("provider %s was requested, but the model runs on %s (%s)", provider, model.provider, why)
 
     def estimate(self, image: bytes | NDArray[np.uint8]) -> Floats:
         """Return ``DepthModel.estimate`` of an encoded panorama.
 
         Raises:
             InferenceError: the image cannot be decoded, or the inference failed or timed out.
-            ValueError: the image is no panorama, or the model's outputs do not fit its manifest.
+            ValueError: the image is not a panorama, or the model's outputs do not match its manifest.
         """
         return self._run(image, lambda rgb: self.model.estimate(rgb))
 
     def complete(self, image: bytes | NDArray[np.uint8], prior: Floats) -> tuple[Floats, Floats]:
-        """Return ``DepthModel.complete`` of an encoded panorama; raises as :meth:`estimate`."""
+        """Return ``DepthModel.complete`` of an encoded panorama. Raises the same errors as :meth:`estimate`."""
         return self._run(image, lambda rgb: self.model.complete(rgb, prior))
 
     def _run(self, image: bytes | NDArray[np.uint8], work: Callable[[NDArray[np.uint8]], Result]) -> Result:
         manifest = self.model.manifest
         try:
-            # Twice the network's input, so that the remaining reduction is by area averaging.
+            # Decode at twice the network's size, so that the rest of the reduction is area averaging.
             rgb = decode_rgb(image, 2 * manifest.input_width, 2 * manifest.input_height)
         except JpegError as error:
             raise InferenceError(f"the image {error}") from error
@@ -79,7 +79,7 @@ class Inference:
             if self.model.provider == "cpu":
                 raise
             self._load("cpu")
-            raise InferenceError(f"{error}; going on with the CPU") from error
+            raise InferenceError(f"{error}; the CPU is used from now on") from error
 
     def _within_timeout(self, work: Callable[[], Result]) -> Result:
         model, future = self.model, Future[Result]()
@@ -97,10 +97,10 @@ class Inference:
         except TimeoutError:
             pass
         for _ in range(_CANCELLATIONS):
-            model.cancel()  # again and again: between two layers, or before the first, it is not heard
+            model.cancel()  # repeated, because onnxruntime ignores it before the first layer and between layers
             if wait([future], _GIVE_UP_S / _CANCELLATIONS).done:
                 break
         else:
-            logger.error("the inference on %s hangs: the node ends for a restart", model.provider)
+            logger.error("the inference on %s hangs; the node ends so that it is restarted", model.provider)
             self._on_hang()
         raise InferenceError(f"the inference took longer than {timeout_s:g} s on {model.provider} and was cancelled")

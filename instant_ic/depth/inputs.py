@@ -1,37 +1,37 @@
-"""Choice of the images whose depth is computed, and when."""
+"""Choice of the images whose depth is computed, and of the time."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
 KEEP_NS = 4_000_000_000
-"""Images and revolutions that differ more from the newest depth are discarded."""
+"""Largest time between kept images or revolutions and the newest image or open request, in nanoseconds."""
 MAX_CLOUD_AGE_S = 0.3
-"""Longest time between an image and the middle of its revolution. An image is held this long, by the stamps."""
+"""Longest time between an image and the middle of its revolution. An image is held for this time, by the stamps."""
 _REPEAT_NS = 2_000_000_000
 
 
 @dataclass(frozen=True)
 class HeldImage:
-    """An image of the camera frame ``frame``, taken at ``stamp_ns``."""
+    """An image, taken at ``stamp_ns`` by the camera with the frame ``frame``."""
 
     frame: str
     stamp_ns: int
 
 
 class RevolutionTrigger:
-    """Chooses images at a limited rate and holds each one until the revolution around it is complete."""
+    """Choice of images at a limited rate. Each image is held until the revolution around it is complete."""
 
     def __init__(self) -> None:
         self._held: HeldImage | None = None
 
     def image(self, image: HeldImage, last_ns: int | None, max_rate_hz: float) -> HeldImage | None:
-        """Take a new image; return a held one for which no revolution arrived.
+        """Hold a new image if it is due; return the held image if its revolution did not arrive.
 
         Args:
-            image: the new one.
+            image: the new image.
             last_ns: stamp of the newest depth; None before the first.
-            max_rate_hz: rate by the images' stamps, with 1 % tolerance.
+            max_rate_hz: highest rate by the images' stamps, with 1 % tolerance.
         """
         late = None
         if self._held is not None and abs(image.stamp_ns - self._held.stamp_ns) > MAX_CLOUD_AGE_S * 1e9:
@@ -42,9 +42,9 @@ class RevolutionTrigger:
         return late
 
     def revolution(self, middle_ns: int) -> HeldImage | None:
-        """Return the held image if a revolution with this middle completes it.
+        """Return the held image if a revolution with this middle is the first after the image.
 
-        A later revolution would be nearer only if the image was taken in the second half of its period.
+        The next revolution could not be nearer to the image.
         """
         if self._held is None or middle_ns < self._held.stamp_ns:
             return None
@@ -56,7 +56,7 @@ class DepthRequests:
     """Requests for the network's depth of an image: one at a time, repeated until there is an answer.
 
     Attributes:
-        since_ns: stamp of the first image that was requested without an answer; None when there is none.
+        since_ns: stamp of the first unanswered request's image; None if all requests were answered.
     """
 
     def __init__(self) -> None:
@@ -64,7 +64,7 @@ class DepthRequests:
         self._newest_ns = 0
 
     def due(self, stamp_ns: int) -> bool:
-        """Return whether to request the depth of this image, or to wait for the answer to an earlier request."""
+        """Return whether to request the depth of this image; False while an answer is pending."""
         if self.since_ns is not None and 0 <= stamp_ns - self._newest_ns < _REPEAT_NS:
             return False
         if self.since_ns is None or stamp_ns < self.since_ns:
@@ -73,5 +73,5 @@ class DepthRequests:
         return True
 
     def answered(self) -> None:
-        """Note that depth has arrived; any depth is the answer, because a slow network answers after the repetition."""
+        """Record that depth has arrived. Any depth counts, because a slow network may answer after a repetition."""
         self.since_ns = None

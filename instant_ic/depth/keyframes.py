@@ -16,9 +16,9 @@ class KeyframeSelectionConfig(Checked):
     """Selection of keyframes.
 
     Attributes:
-        distance_m: metres of motion to a new keyframe; smaller renews the virtual space more often.
-        angle_deg: degrees of rotation to a new keyframe.
-        refresh_s: seconds after which a standing robot takes a new keyframe, because things around it may have moved.
+        distance_m: metres of motion until a new keyframe; a smaller value updates the virtual space more often.
+        angle_deg: degrees of rotation until a new keyframe.
+        refresh_s: seconds after which a standing robot takes a new keyframe, because objects may have moved.
         unfit_after_s: seconds that a due keyframe waits for depth that can be scaled.
     """
 
@@ -29,7 +29,7 @@ class KeyframeSelectionConfig(Checked):
 
 
 class KeyframeSelector:
-    """Decide of which images a keyframe could be taken, and for each scaled depth image whether it becomes one.
+    """Selection of keyframes: first of images that may become one, then among those with depth.
 
     Attributes:
         count: number of keyframes.
@@ -44,12 +44,12 @@ class KeyframeSelector:
         self._due_since_ns: int | None = None
 
     def take(self, map_from_camera: NDArray[np.float64], fit: bool, stamp_ns: int) -> bool:
-        """Return whether the image at this pose becomes a keyframe; if so it is the last one from now on.
+        """Return whether the image at this pose becomes a keyframe, and remember it as the last keyframe if so.
 
         Args:
-            map_from_camera: (4, 4) pose of the image.
-            fit: its depth could be scaled.
-            stamp_ns: its time; waiting is measured by it.
+            map_from_camera: pose of the image, (4, 4).
+            fit: True if the depth could be scaled.
+            stamp_ns: time of the image, by which waiting is measured.
         """
         if not self.due(map_from_camera, stamp_ns, fit):
             self._due_since_ns = None
@@ -65,11 +65,11 @@ class KeyframeSelector:
         return True
 
     def restart(self) -> None:
-        """Forget the last keyframe: the next fit image becomes one. The count goes on."""
+        """Forget the last keyframe, so that the next fit image becomes one. The count continues."""
         self._pose, self._fit, self._due_since_ns = None, False, None
 
     def due(self, map_from_camera: NDArray[np.float64], stamp_ns: int, fit: bool = True) -> bool:
-        """Return whether an image at this pose and time would become a keyframe; ``fit``: its depth could be scaled."""
+        """Return whether an image at this pose and time would become a keyframe, if its depth is ``fit``."""
         if self._pose is None or (fit and not self._fit):
             return True
         if fit and stamp_ns - self._taken_ns >= self.config.refresh_s * 1e9:
@@ -85,14 +85,14 @@ _LEAST_SIGMA, _SIGMA_SPAN = 0.002, 500.0
 
 
 def encode_sigma(sigma: NDArray[np.floating]) -> NDArray[np.uint8]:
-    """Encode relative standard deviations (H, W) as bytes, 2.5 % a step; 0 where not finite (see Keyframe.msg)."""
+    """Encode relative standard deviations (H, W) as bytes in steps of 2.5 %; 0 is not finite (see Keyframe.msg)."""
     known = np.isfinite(sigma)
     share = np.log(np.maximum(np.where(known, sigma, 1.0), _LEAST_SIGMA) / _LEAST_SIGMA) / math.log(_SIGMA_SPAN)
     return np.where(known, 1 + np.rint(254 * np.minimum(share, 1.0)), 0).astype(np.uint8)
 
 
 def decode_sigma(code: NDArray[np.uint8]) -> NDArray[np.float32]:
-    """Decode the image of ``encode_sigma``; inf where unknown."""
+    """Decode an image of ``encode_sigma``; inf is unknown."""
     sigma = _LEAST_SIGMA * _SIGMA_SPAN ** ((np.arange(256) - 1) / 254)
     sigma[0] = np.inf
     return np.asarray(sigma.astype(np.float32)[code])

@@ -1,14 +1,14 @@
-"""Depth of the whole panorama from the points of one LiDAR revolution, by a structure of walls, floor and ceiling.
+"""Depth of the whole panorama from the points of one LiDAR revolution, with a structure of walls, floor and ceiling.
 
-A VLP-16 covers 30 degrees of elevation, the panorama 180. Elsewhere a building's usual structure is assumed: the last
-surface in a column of the image is an upright wall on a level floor, under a level ceiling. ``LidarStructure`` takes
-these steps:
+A VLP-16 covers 30 degrees of elevation, the panorama 180. The remaining part is filled with the usual structure of a
+building: the last surface in a column of the image is an upright wall between a level floor and a level ceiling.
+``LidarStructure`` takes these steps:
 
-1. Level the points by ``level_from_camera``, and remove the lonely ones (``_confirmed``).
-2. ``plane_height``: find floor and ceiling, on which points that follow each other upwards are of one height.
+1. Level the points by ``level_from_camera``, and remove isolated points (``_confirmed``).
+2. ``plane_height``: find floor and ceiling, on which vertically adjacent points have the same height.
 3. ``_Building``: fill the level image column by column. ``_walls`` interpolates upright surfaces between points and
-   continues them up (``_crown``) and down, ``_plates`` adds level surfaces between two points of one height,
-   ``_planes`` cuts all by floor and ceiling, and ``fill`` bridges narrow azimuths without a return.
+   continues them up (``_crown``) and down, ``_plates`` adds level surfaces between two points of the same height,
+   ``_planes`` cuts all surfaces at floor and ceiling, and ``fill`` bridges narrow azimuths without a return.
 4. ``structure_sigma``: give each pixel the uncertainty of its ``Origin``, fitted on simulated rooms.
 """
 
@@ -35,10 +35,10 @@ class StructureTuning:
     """Tuning of the structure.
 
     Attributes:
-        min_points: fewest points from which a structure is built.
-        max_under_floor: largest share of points under the floor; more mean a wrong height or tilt of the camera, or
-            stairs that go down.
-        max_gap_deg: widest azimuth without any return that is bridged; a wider one is open, and unknown.
+        min_points: smallest number of points from which a structure is built.
+        max_under_floor: largest share of points under the floor; a larger share means a wrong height or tilt of the
+            camera, or stairs that lead down.
+        max_gap_deg: widest azimuth without any return that is bridged; wider azimuths remain unknown.
         floor_tolerance_m: largest distance of a point from floor or ceiling that still counts as on it.
         same_surface: largest relative difference of the horizontal ranges of two points of one upright surface.
     """
@@ -57,13 +57,13 @@ class Origin(IntEnum):
     """Origin of a pixel's depth."""
 
     UNKNOWN = 0
-    BEAM = 1  # a point fell into it
+    BEAM = 1  # the pixel contains a point
     BETWEEN = 2  # between two points of the same upright surface
-    EDGE = 3  # between two points of different surfaces: one of the two
+    EDGE = 3  # between two points of different surfaces, on one of them
     UP = 4  # upright surface, continued above its uppermost point
     DOWN = 5  # upright surface, continued below its lowest point
     FLOOR = 6  # level floor
-    CEILING = 7  # level ceiling that points were seen on
+    CEILING = 7  # level ceiling on which points were seen
     ASSUMED = 8  # level ceiling, or floor, at an assumed height
 
 
@@ -74,7 +74,7 @@ class LidarDepthConfig:
     Attributes:
         min_range_m: points nearer than this to the camera are left out (the robot itself).
         max_range_m: points farther than this are left out; farther surfaces are unknown.
-        ceiling_height_m: height of the ceiling over the floor where no point was seen on it.
+        ceiling_height_m: height of the ceiling over the floor if no point was seen on the ceiling.
         top_ring_deg: elevation of the LiDAR's uppermost ring.
     """
 
@@ -86,19 +86,19 @@ class LidarDepthConfig:
     def __post_init__(self) -> None:
         check_ranges(self)
         if not self.min_range_m < self.max_range_m:
-            raise ValueError(f"min_range_m must be under max_range_m (got {self.min_range_m}, {self.max_range_m})")
+            raise ValueError(f"min_range_m must be below max_range_m (got {self.min_range_m}, {self.max_range_m})")
 
 
 @dataclass(frozen=True)
 class LidarDepth:
-    """Depth from points alone.
+    """A depth image from points alone.
 
     Attributes:
         depth_m: radial depth in metres, (H, W) float32; 0 is unknown.
         origin: ``Origin`` of each pixel, (H, W) uint8.
-        gap_rad: angle to the next point above or below, (H, W) float32; pi where there is none.
+        gap_rad: angle to the next point above or below, (H, W) float32; pi if there is none.
         points: number of points used.
-        camera_height_m: height of the camera over the floor, given or found; None if neither.
+        camera_height_m: height of the camera over the floor, given or found from points; None if unknown.
         ceiling_height_m: height of the ceiling over the camera, found from points; None if no ceiling was seen.
         message: reason for not trusting ``depth_m``; empty if it is trusted.
     """
@@ -118,10 +118,10 @@ class LidarDepth:
 
 
 def level_from_camera(up: Floats) -> NDArray[np.float64]:
-    """Return the smallest rotation (3, 3) that turns ``up`` (3,), gravity's up in the camera's frame, onto z.
+    """Return the smallest rotation (3, 3) from ``up`` (3,), the up direction in the camera's frame, to z.
 
     Raises:
-        ValueError: ``up`` is no direction, or the camera hangs upside down within a degree.
+        ValueError: ``up`` is not a direction, or the camera is within a degree of upside down.
     """
     up = np.asarray(up, np.float64)
     length = float(np.linalg.norm(up)) if up.shape == (3,) else float("nan")
@@ -129,23 +129,23 @@ def level_from_camera(up: Floats) -> NDArray[np.float64]:
         raise ValueError(f"up must be a direction of three finite numbers (got {up})")
     x, y, z = up / length
     if z < -0.9998:
-        raise ValueError("the camera hangs upside down: up points along its -z")
+        raise ValueError("the camera is upside down: up points along its -z axis")
     # Rodrigues' formula for the axis up x z.
     axis = np.array([[0.0, 0.0, -x], [0.0, 0.0, -y], [x, y, 0.0]])
     return np.asarray(np.eye(3) + axis + axis @ axis / (1.0 + z))
 
 
 def plane_height(z: Floats, across_m: Floats, columns: NDArray[np.intp], bin_m: float = 0.04) -> float | None:
-    """Return the height of the level plane that most points lie on; None if no plane stands out.
+    """Return the height of the level plane on which most points lie; None if no plane stands out.
 
-    Points that follow each other upwards in a column of the image are of one height on a plane, and of one
-    horizontal range on a wall.
+    Vertically adjacent points in a column of the image have the same height on a plane, and the same horizontal range
+    on a wall.
 
     Args:
-        z: (N,) heights, metres.
-        across_m: (N,) horizontal ranges.
-        columns: (N,) columns of the image.
-        bin_m: width of the histogram's bins.
+        z: heights in metres, (N,).
+        across_m: horizontal ranges in metres, (N,).
+        columns: columns of the image, (N,).
+        bin_m: width of the histogram's bins in metres.
     """
     order = np.lexsort((across_m, columns))
     z, across_m, columns = z[order], across_m[order], columns[order]
@@ -154,7 +154,7 @@ def plane_height(z: Floats, across_m: Floats, columns: NDArray[np.intp], bin_m: 
     if pair.sum() < 20:
         return None
     heights = 0.5 * (z[1:] + z[:-1])[pair]
-    # Nothing is seen through a floor or a ceiling; a table has points on both sides.
+    # Floor and ceiling have no points behind them, while a table has points on both sides.
     sign = 1.0 if heights.mean() > 0 else -1.0
     heights = heights[sign * heights > np.quantile(sign * z, 0.98) - 0.2]
     if len(heights) < 20:
@@ -170,13 +170,13 @@ _AROUND = [(row, column) for row in (-2, -1, 0, 1, 2) for column in (-2, -1, 1, 
 def lonely(
     measured: Floats, rows: NDArray[np.intp], columns: NDArray[np.intp], alike: float = 0.12
 ) -> NDArray[np.bool_]:
-    """Return a mask (N,) of points without neighbours that confirm them: dust, mixed pixels, mirrors.
+    """Return a mask (N,) of points that no neighbour confirms, such as dust, mixed pixels and reflections.
 
     Args:
-        measured: (H, W) ranges, 0 where no point is.
+        measured: ranges in metres, (H, W); 0 if a pixel has no point.
         rows: rows of the pixels with points, (N,).
-        columns: columns of them, (N,).
-        alike: two ranges are alike when they differ by less than this share.
+        columns: columns of the pixels with points, (N,).
+        alike: largest relative difference of two ranges that confirm each other.
     """
     height, width = measured.shape
     own = measured[rows, columns]
@@ -186,14 +186,14 @@ def lonely(
         other = measured[np.clip(rows + row, 0, height - 1), (columns + column) % width]
         there += other > 0
         same += np.abs(other - own) < alike * own
-    # A point that is wrong along its beam shows elsewhere in the camera's image, often with nothing around it.
+    # A point with a wrong range appears elsewhere in the camera's image, often without any neighbours.
     return np.asarray((same < 2) & (float(np.median(there)) >= 4))
 
 
 def _confirmed(
     points: Floats, size: tuple[int, int]
 ) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.intp], Floats]:
-    """Return the nearest point (N, 3) in each pixel, without lonely ones: index, row, column and range, each (M,)."""
+    """Return index, row, column and range, (M,) each, of the nearest point (N, 3) in each pixel, if it is confirmed."""
     rows, columns, range_m = pixels_of(points, size[1], size[0])
     nearest = np.full(size, -1, np.intp)
     far_first = np.argsort(-range_m, kind="stable")
@@ -206,7 +206,7 @@ def _confirmed(
 
 
 class LidarStructure:
-    """Estimates depth images from points."""
+    """Estimator of depth images from points."""
 
     def __init__(self, config: LidarDepthConfig | None = None) -> None:
         self.config = config or LidarDepthConfig()
@@ -222,12 +222,11 @@ class LidarStructure:
         """Estimate the depth of every pixel that the structure reaches.
 
         Args:
-            points: (N, 3) in the camera's frame, metres; points that are not finite are left out.
-            up: (3,) gravity's up in the camera's frame.
-            camera_height_m: height of the camera over the floor; None searches the points for the floor.
+            points: points in the camera's frame in metres, (N, 3); points that are not finite are left out.
+            up: up direction (against gravity) in the camera's frame, (3,).
+            camera_height_m: height of the camera over the floor; None to find the floor from the points.
             size: height and width of the image.
-            ceiling_m: height of a ceiling over the camera that is taken where no point shows one (instead of the
-                assumed height).
+            ceiling_m: height of the ceiling over the camera if no point shows it; None for the configured height.
 
         Raises:
             ValueError: shapes or ``up`` are wrong.
@@ -238,7 +237,7 @@ class LidarStructure:
         level = self._usable(points) @ turn.T
         if len(level) < TUNING.min_points:
             words = (
-                f"{len(level)} LiDAR points between {self.config.min_range_m} and {self.config.max_range_m} m, "
+                f"{len(level)} LiDAR points between {self.config.min_range_m} and {self.config.max_range_m} m; "
                 f"{TUNING.min_points} are needed"
             )
             nothing = np.zeros(size, np.float32), np.zeros(size, np.uint8), np.full(size, np.pi, np.float32)
@@ -262,7 +261,7 @@ class LidarStructure:
         )
 
     def ranges(self, points: Floats, size: tuple[int, int]) -> NDArray[np.float32]:
-        """Return the range (H, W) in each pixel that a confirmed point (N, 3) falls into, else 0."""
+        """Return the range (H, W) of the confirmed point (N, 3) in each pixel; 0 if there is none."""
         picture = np.zeros(size, np.float32)
         _, rows, columns, range_m = _confirmed(self._usable(points), size)
         picture[rows, columns] = range_m
@@ -282,7 +281,7 @@ class LidarStructure:
         if under > TUNING.max_under_floor:
             return (
                 f"{under:.0%} of the points lie under the floor ({floor:.2f} m under the camera): "
-                "height or tilt of the camera is wrong, or stairs go down"
+                "height or tilt of the camera is wrong, or stairs lead down"
             )
         return ""
 
@@ -291,9 +290,10 @@ class _Building:
     """The structure in a level image, column by column.
 
     Attributes:
-        hit: horizontal range of the point in each pixel, (H, W); 0 without one.
-        flat: pixels whose point is of the floor or the ceiling, (H, W).
-        above, below: rows of the next points, (H, W), -1 and H without one; up, down: their indices within the image.
+        hit: horizontal range of the point in each pixel, (H, W); 0 if there is none.
+        flat: pixels whose point lies on the floor or the ceiling, (H, W).
+        above, below: rows of the next points above and below, (H, W); -1 and H if there is none.
+        up, down: indices of the next points in the image.
     """
 
     def __init__(
@@ -312,7 +312,7 @@ class _Building:
         elevation = (np.pi / 2 - (np.arange(height) + 0.5) * (np.pi / height)).astype(np.float32)[:, None]
         self.cos, self.sin, self.tan = np.cos(elevation), np.sin(elevation), np.tan(elevation)
         z = range_m * self.sin[rows, 0]
-        # A row is half a pixel uncertain, which far away is more than the tolerance.
+        # A point's row is uncertain by half a pixel, which exceeds the tolerance at long range.
         slack = TUNING.floor_tolerance_m + range_m * (np.pi / height)
         of_plane = np.zeros(len(z), bool)
         if floor is not None:
@@ -324,7 +324,7 @@ class _Building:
         self.flat = np.zeros(size, bool)
         self.flat[rows, columns] = of_plane
         self.some = self.hit > 0
-        # An unknown floor lies as low as the lowest points, or lower.
+        # An unknown floor is assumed at the height of the lowest points.
         self.ground = floor if floor is not None else _highest(-z)
         self.ground_origin = Origin.FLOOR if floor is not None else Origin.ASSUMED
         usual = config.ceiling_height_m - self.ground if ceiling_guess is None else ceiling_guess
@@ -355,7 +355,7 @@ class _Building:
         bridged = (used >= 0) & (used != column)
         depth, origin, gap = depth[:, used], origin[:, used], gap[:, used]
         origin[:, bridged] = np.where(origin[:, bridged] == Origin.BEAM, Origin.EDGE, origin[:, bridged])
-        # Nothing came back: open, or too near to be measured. Only what the robot stands on is sure.
+        # Columns without a return are open, or too near to be measured. Only the floor under the robot is certain.
         ground = np.zeros((height, 1), np.float32)
         if self.floor is not None:
             near = -self.floor / self.tan < self.config.min_range_m
@@ -365,7 +365,7 @@ class _Building:
         return depth.astype(np.float32), origin, (gap * (np.pi / height)).astype(np.float32)
 
     def _walls(self, index: Indices) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
-        """Return the horizontal range (0: none, NaN: unknown) of each pixel's upright surface, and its origin.
+        """Return the horizontal range of each pixel's upright surface (0: none, NaN: unknown) and its origin.
 
         Args:
             index: rows of the image, (H, 1).
@@ -388,9 +388,9 @@ class _Building:
             (both & ~same, np.where(nearer_above, r_above, r_below), Origin.EDGE),
             (wall_above & (flat_below | (below == len(index))), r_above, Origin.DOWN),
             (wall_below & flat_above & (self.sin > 0), r_below, Origin.UP),
-            # Something low with floor seen over it: its top is somewhere between.
+            # A low object with floor visible above it: its top lies somewhere between the two points.
             (wall_below & flat_above & (self.sin <= 0) & ~nearer_above, r_below, Origin.EDGE),
-            # Without a crown its end is unknown (a window, the sky): floor does not begin at its highest point.
+            # Without a crown, the upper end of the surface is unknown (a window, the sky).
             (wall_below & (above < 0), np.where(crown > 0, crown, np.nan), Origin.UP),
         ):
             np.copyto(wall, value, where=where)
@@ -398,10 +398,10 @@ class _Building:
         return wall, origin
 
     def _crown(self) -> NDArray[np.float32]:
-        """Return the horizontal range (W,) at which each column continues above its uppermost point, 0 where unknown.
+        """Return the horizontal range (W,) at which each column continues above its uppermost point; 0 is unknown.
 
-        A column is known up to its top where the LiDAR's uppermost ring has a return. Elsewhere that ring passed over
-        the surface below it, and the nearest column with a top gives the range behind.
+        If the LiDAR's uppermost ring has a return in a column, the column continues at that range. Otherwise the ring
+        passed over the column's surface, and the range behind it is taken from the nearest column with such a return.
         """
         upright = np.where(self.flat, 0, self.hit)
         row = (upright > 0).argmax(axis=0)
@@ -412,7 +412,7 @@ class _Building:
         return np.where(donor >= 0, across[donor], 0).astype(np.float32)
 
     def _plates(self, depth: Floats, origin: NDArray[np.uint8]) -> None:
-        """Put a level surface between two points of one height: a table, a bench."""
+        """Insert a level surface, such as a table or a bench, between two points of the same height."""
         high, low = (self.hit[place] * self.tan[place[0], 0] for place in (self.up, self.down))
         edge = (origin == Origin.EDGE) & (self.above >= 0) & (self.below < self.size[0])
         plate = edge & ~self.flat[self.up] & (high < -0.15) & (np.abs(high - low) < 0.05)
@@ -424,7 +424,7 @@ class _Building:
         to_floor = np.where(self.sin < 0, -self.ground / self.sin, np.inf)
         np.copyto(origin, np.uint8(self.ground_origin), where=to_floor < depth)
         np.minimum(depth, to_floor, out=depth)
-        # Never lower than what was seen upright in this column: there the ceiling is higher.
+        # The ceiling is not lower than the highest upright surface that was seen in the column.
         seen = _middle(np.where(self.some & ~self.flat, self.hit * self.tan, 0).max(axis=0)) + 0.05
         roofed = (wall > 0) | np.any(self.flat & (self.hit * self.tan > 0), axis=0)
         to_top = np.where((self.sin > 0) & roofed, np.maximum(self.top, seen) / self.sin, np.inf)
@@ -435,7 +435,7 @@ class _Building:
         return _bridge(seen, round(TUNING.max_gap_deg / 360 * self.size[1]))
 
 
-#: Relative standard deviation at a point and its growth with the angle (1/rad) to it, for each ``Origin``.
+#: Relative standard deviation at a point, and its growth (1/rad) with the angle to the point, for each ``Origin``.
 #: Fitted on simulated rooms so that 68 % of the errors are smaller.
 _SIGMA = np.array(
     [
@@ -451,32 +451,32 @@ _SIGMA = np.array(
     ],
     np.float32,
 )
-#: Worlds are even and a simulated camera hangs where it is said to; nothing real is known better than this.
+#: Smallest relative standard deviation of real surfaces. Simulated ones are even and the camera's pose is exact.
 LEAST_SIGMA = 0.005
 
 
 def structure_sigma(origin: NDArray[np.uint8], gap_rad: Floats) -> NDArray[np.float32]:
-    """Return the relative standard deviation (H, W) of pixels of an ``Origin`` whose next point is ``gap_rad`` away."""
+    """Return the relative standard deviation (H, W) of pixels by ``Origin`` and angle to the next point."""
     base, by_gap = (np.ascontiguousarray(column)[origin] for column in _SIGMA.T)
     sigma = np.hypot(base, by_gap * gap_rad)
     return np.asarray(np.maximum(sigma, LEAST_SIGMA), np.float32)
 
 
 def _highest(z: Floats) -> float:
-    """Return the height under which nearly all of the heights (N,) lie, at least 0.1 m."""
+    """Return the height below which nearly all heights (N,) lie; at least 0.1 m."""
     return max(0.1, float(np.quantile(z, 0.995))) if len(z) else 0.1
 
 
 def _reaches_top(across: Floats, z: Floats, slope: float) -> NDArray[np.bool_]:
-    """Return the columns (W,) whose uppermost upright point lies where the LiDAR's uppermost ring runs.
+    """Return the columns (W,) whose uppermost upright point was measured by the LiDAR's uppermost ring.
 
-    In range and height the ring is a line of known slope. Its height at range 0, the LiDAR's, is that of the highest
-    points: a line fitted to them as well is wrong where far walls are seen by lower rings only.
+    In a diagram of height over range the ring is a line of known slope. Its height at range 0 is fitted to the highest
+    points only, because lower rings see far walls and would distort a fit of the slope.
 
     Args:
-        across: horizontal range of that point, 0 where there is none.
-        z: its height.
-        slope: slope of the ring.
+        across: horizontal range of the uppermost upright point in metres, (W,); 0 if there is none.
+        z: height of this point in metres, (W,).
+        slope: height of the ring over range.
     """
     there = across > 0
     if not there.any():
@@ -492,7 +492,7 @@ def _middle(values: Floats, reach: int = 3) -> Floats:
 
 
 def _bridge(seen: NDArray[np.bool_], most: int) -> NDArray[np.intp]:
-    """Return for each column the nearest that has points, -1 if none is within a gap of ``most`` columns; they wrap."""
+    """Return for each column the nearest column with points, or -1 in gaps wider than ``most``. Columns wrap."""
     width = len(seen)
     places = np.flatnonzero(seen)
     if len(places) == 0:

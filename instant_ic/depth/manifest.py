@@ -19,11 +19,11 @@ REQUIRED = ("model", "name", "licence", "input_height", "input_width")
 
 
 class ManifestError(ValueError):
-    """The manifest of a depth model is missing, malformed or does not fit its model."""
+    """The manifest of a depth model is missing, malformed or does not match its model."""
 
 
 class InferenceError(RuntimeError):
-    """The inference did not finish; the text says why."""
+    """The inference did not finish; the message says why."""
 
 
 @dataclass(frozen=True)
@@ -36,22 +36,22 @@ class ModelManifest:
         model: file name of the ONNX model, beside the manifest.
         name: name shown to people.
         licence: licence of the weights.
-        input_height: rows that the network takes.
-        input_width: columns that the network takes, twice the rows.
-        brightness: mean byte of the images that the model was trained on. An image is brought to it by one factor, at
-            most 2.5: a real camera's exposure is not that of the training. 0 leaves it as it is.
-        mean: subtracted from the input, a value a channel.
-        std: divisor of the input after that.
+        input_height: rows of the network's input.
+        input_width: columns of the network's input, twice the rows.
+        brightness: mean byte of the training images. Images are scaled to it by a factor of at most 2.5, because a real
+            camera's exposure differs from that of the training. 0 leaves images unchanged.
+        mean: value per channel that is subtracted from the input.
+        std: value per channel by which the difference is divided.
         output_kind: unit of the depth, one of ``scaler.OUTPUT_KINDS``.
-        min_range_m: metric depth between 0 and this is raised to it.
-        max_range_m: metric depth above it is cut to it.
-        prior_input: name of the input that takes incomplete depth, (1, 6, height, width) float32
-            (``depth.completion.prior_channels``); empty for a model that takes the image alone.
+        min_range_m: smallest metric depth; smaller known depth is set to it.
+        max_range_m: largest metric depth; larger depth is set to it.
+        prior_input: name of the input for incomplete depth, (1, 6, height, width) float32
+            (``depth.completion.prior_channels``); empty for a model that uses only the image.
         sigma_output: name of the output with the relative standard deviation; required with ``prior_input``.
         sha256: checksum of the model file; empty to leave it unchecked.
 
     Raises:
-        ValueError: a value is wrong; the text starts with its key.
+        ValueError: a value is wrong; the message starts with its key.
     """
 
     model: str = ""
@@ -91,11 +91,11 @@ def load_manifest(path: str | Path) -> ModelManifest:
     """Read and check a manifest.
 
     Raises:
-        ManifestError: the manifest is wrong; the text names file, line, key and the expected value.
+        ManifestError: the manifest is wrong; the message names file, line, key and the expected value.
     """
     path = Path(path)
     if not paths.is_file(path):
-        raise ManifestError(f"{path}: no manifest. A depth model needs one beside it (docs/depth.md)")
+        raise ManifestError(f"{path}: no manifest. A depth model needs a manifest beside it (docs/depth.md)")
     try:
         fields = load(path).fields()
         values = {key: Value(field.spelled(), f"{path}:{field.line}") for key, field in fields.items()}
@@ -111,7 +111,7 @@ def load_manifest(path: str | Path) -> ModelManifest:
 
 
 def save_manifest(manifest: ModelManifest, path: str | Path) -> None:
-    """Write a manifest that :func:`load_manifest` reads back equal."""
+    """Write a manifest for :func:`load_manifest`."""
     values = asdict(manifest)
     values["mean"], values["std"] = list(manifest.mean), list(manifest.std)
     text = "# Interface of the depth model beside this file; the keys are explained in docs/depth.md.\n"

@@ -1,4 +1,4 @@
-"""The usual measures of a depth map, over valid pixels only (numpy)."""
+"""The usual error measures of depth maps, over valid pixels only (numpy)."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ Floats = NDArray[np.floating]
 
 @dataclass(frozen=True)
 class DepthMetrics:
-    """Errors of one depth map or the mean over several.
+    """Errors of a depth map, or their mean over several maps.
 
     Attributes:
         mre: mean of |d - t| / t.
         mae_m: mean of |d - t|, metres.
         rmse_m: root of the mean of (d - t)², metres.
         delta1: share of pixels with max(d/t, t/d) < 1.25; ``delta2`` with 1.25², ``delta3`` with 1.25³.
-        scale_error_median: |median of d / t - 1|, how wrong the scale of the whole map is.
+        scale_error_median: |median of d / t - 1|, the error of the whole map's scale.
         pixels: number of valid pixels.
     """
 
@@ -44,17 +44,17 @@ def depth_metrics(
     valid: NDArray[np.bool_] | None = None,
     weights: Floats | None = None,
 ) -> DepthMetrics:
-    """Compare two depth maps of the same shape, metres.
+    """Compare two depth maps of the same shape, in metres.
 
-    A pixel counts where the truth is finite and positive, and ``valid`` where given. A prediction that is not
-    positive or not finite counts as 0 m: a full relative error and no hit in any delta.
+    A pixel counts if its truth is finite and positive, and if it is ``valid``. A prediction that is not positive or not
+    finite counts as 0 m, which gives a relative error of 1 and no hit in any delta.
 
     Args:
         predicted: predicted depth, usually (H, W).
-        truth: true depth, of the same shape.
-        valid: same shape; False leaves a pixel out.
-        weights: weight of each pixel, of a shape that broadcasts to theirs; by default all the same. For an
-            equirect image by solid angle: ``solid_angle_weights(height)[:, None]``.
+        truth: true depth, in the same shape.
+        valid: mask of the pixels that count, in the same shape; None if all count.
+        weights: weights of the pixels, broadcast to their shape; None weights all equally. For an equirect image by
+            solid angle: ``solid_angle_weights(height)[:, None]``.
 
     Raises:
         ValueError: the shapes differ or no pixel is valid.
@@ -87,7 +87,7 @@ def depth_metrics(
 
 
 def _median(values: Floats, weights: Floats) -> float:
-    """Return the weighted median: the mean of the values at which half of the weight is just not and just reached."""
+    """Return the weighted median: the mean of the two values around half of the cumulative weight."""
     order = np.argsort(values)
     total = np.cumsum(weights[order])
     half = 0.5 * total[-1]
@@ -97,10 +97,10 @@ def _median(values: Floats, weights: Floats) -> float:
 
 
 def mean_metrics(each: Sequence[DepthMetrics]) -> DepthMetrics:
-    """Return the mean over maps (every map counts the same); ``pixels`` is the sum.
+    """Return the mean over maps, in which every map has the same weight; ``pixels`` is the sum.
 
     Raises:
-        ValueError: nothing to average.
+        ValueError: there are no metrics.
     """
     if not each:
         raise ValueError("no metrics to average")
@@ -110,10 +110,10 @@ def mean_metrics(each: Sequence[DepthMetrics]) -> DepthMetrics:
 
 
 def solid_angle_weights(height: int) -> NDArray[np.float32]:
-    """Return the weight of each row of an equirect image, (height,), mean 1.
+    """Return the weight of each row of an equirect image, (height,), with a mean of 1.
 
-    The solid angle of a pixel is proportional to the sine difference of its edges' elevations. Without it the poles,
-    which fill many pixels and little space, rule a mean over pixels.
+    The solid angle of a pixel is proportional to the difference of the sines of its edges' elevations. Without these
+    weights, the poles, which have many pixels but little solid angle, would dominate a mean.
     """
     edges = np.pi / 2 - np.arange(height + 1) * (np.pi / height)
     weights = np.sin(edges[:-1]) - np.sin(edges[1:])

@@ -1,4 +1,4 @@
-"""Depth of a panorama by an ONNX model and its manifest (onnxruntime)."""
+"""Depth of a panorama from an ONNX model and its manifest (onnxruntime)."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from instant_ic.util.paths import shipped_file
 DEFAULT_MODEL = "slicenet_small.onnx"
 DEFAULT_COMPLETION = "completion.onnx"
 MAX_GAIN = 2.5
-"""An image's brightness is changed by this factor at most, up or down."""
+"""Largest factor by which an image's brightness is raised or lowered."""
 
 
 class DepthModel:
@@ -44,17 +44,17 @@ class DepthModel:
 
     @classmethod
     def load(cls, path: str | Path, threads: int = 2, provider: str = "auto") -> DepthModel:
-        """Open a model by its ``.onnx`` or its manifest.
+        """Open a model from its ``.onnx`` file or its manifest.
 
         Args:
-            path: the model or the manifest beside it.
-            threads: CPU threads of one inference. The result does not depend on the time of day or on load.
-            provider: ``auto`` (the fastest that works), ``tensorrt``, ``cuda`` or ``cpu``. One that does not
-                work falls back to the next; see :attr:`provider`.
+            path: the model file or the manifest beside it.
+            threads: CPU threads of one inference. The result does not depend on the machine's load.
+            provider: ``auto`` (the fastest that works), ``tensorrt``, ``cuda`` or ``cpu``. If it does not work, the
+                next one is used; see :attr:`provider`.
 
         Raises:
-            ManifestError: manifest or model is missing or they do not fit each other.
-            ValueError: no such provider, ``threads`` < 1.
+            ManifestError: manifest or model is missing, or they do not match.
+            ValueError: the provider is unknown, or ``threads`` < 1.
         """
         manifest_file = manifest_path(path)
         manifest = load_manifest(manifest_file)
@@ -65,8 +65,8 @@ class DepthModel:
             with model_file.open("rb") as file:
                 found = hashlib.file_digest(file, "sha256").hexdigest()
             if found != manifest.sha256:
-                raise ManifestError(f"{model_file}: SHA-256 differs from the manifest's: the file is damaged or "
-                                    f"another (got {found})")  # fmt: skip
+                raise ManifestError(f"{model_file}: SHA-256 differs from the manifest's; the file is damaged or "
+                                    f"another model (got {found})")  # fmt: skip
         try:
             session = open_session(model_file, threads, provider)
         except ValueError:
@@ -85,7 +85,7 @@ class DepthModel:
             provider: as for :meth:`load`.
 
         Raises:
-            FileNotFoundError: there is no model of this name.
+            FileNotFoundError: no model has this name.
         """
         bare = Path(name).name == name
         return cls.load(shipped_file("models", name) if bare else name, threads, provider)
@@ -101,21 +101,21 @@ class DepthModel:
         return [(a.name, a.type, list(a.shape)) for a in self._session.get_outputs()]
 
     def estimate(self, rgb: NDArray[np.uint8]) -> NDArray[np.float32]:
-        """Estimate depth in the model's own unit (metres for metric models), radial, 0 = unknown.
+        """Estimate radial depth in the model's unit (metres for metric models); 0 is unknown.
 
         Args:
             rgb: equirect panorama of any size, (H, W, 3) uint8, twice as wide as high.
 
         Returns:
-            (h, 2h) float32 with the rows of the network's output. Metric depth is cut to the manifest's range.
+            Depth in the size of the network's output, (h, 2h) float32. Metric depth is clipped to the manifest's range.
 
         Raises:
-            ValueError: not such an array.
+            ValueError: ``rgb`` has another shape or type, or the model is a completion model.
             ManifestError: the outputs differ from the manifest.
             InferenceError: the network failed, or :meth:`cancel` ended it.
         """
         if self.manifest.prior_input:
-            raise ValueError(f"{self.manifest.name} corrects fused depth: use it as completion of depth_scaler")
+            raise ValueError(f"{self.manifest.name} corrects fused depth; use it as completion of depth_scaler")
         (depth,) = self._run({self._input: self.prepare(rgb)})
         return self._finish(depth)
 
@@ -132,19 +132,19 @@ class DepthModel:
             Depth in metres and its relative standard deviation, (h, 2h) float32 each.
 
         Raises:
-            ValueError: the model takes no prior, or another shape than this one's.
+            ValueError: the model takes no prior, or the prior has another shape.
             ManifestError, InferenceError: as for :meth:`estimate`.
         """
         manifest = self.manifest
         size = (PRIOR_CHANNELS, manifest.input_height, manifest.input_width)
         if not manifest.prior_input:
-            raise ValueError(f"{manifest.name} takes the image alone; a model of ic depth train is needed")
+            raise ValueError(f"{manifest.name} uses only the image; a model of ic depth train is needed")
         if prior.shape != size:
             raise ValueError(f"the prior must be {size} (got {prior.shape})")
         feeds = {self._input: self.prepare(rgb), manifest.prior_input: prior[None].astype(np.float32)}
         depth, sigma = self._run(feeds)
         doubt = self._plane(sigma, manifest.sigma_output)
-        doubt[~(doubt > 0)] = np.inf  # also where it is not a number
+        doubt[~(doubt > 0)] = np.inf  # includes NaN
         return self._finish(depth), doubt
 
     def _run(self, feeds: dict[str, NDArray[Any]]) -> list[Any]:
@@ -160,7 +160,7 @@ class DepthModel:
         return outputs
 
     def cancel(self) -> None:
-        """Cancel an inference that runs in another thread, at its next layer."""
+        """Cancel an inference that runs in another thread. It ends at its next layer."""
         if (options := self._run_options) is not None:
             options.terminate = True
 
@@ -168,7 +168,7 @@ class DepthModel:
         """Return the network's input, (1, 3, h, 2h): resized by area averaging, then normalised.
 
         Raises:
-            ValueError: ``rgb`` is not (H, W, 3) uint8, or no panorama.
+            ValueError: ``rgb`` is not (H, W, 3) uint8, or not a panorama.
         """
         manifest = self.manifest
         if rgb.ndim != 3 or rgb.shape[2] != 3 or rgb.dtype != np.uint8 or 0 in rgb.shape:
@@ -182,8 +182,8 @@ class DepthModel:
         levels = np.arange(256, dtype=np.float32)
         if manifest.brightness:
             gain = np.clip(manifest.brightness / max(float(rgb.mean()), 1.0), 1 / MAX_GAIN, MAX_GAIN)
-            levels = np.minimum(np.round(levels * gain), 255).astype(np.float32)  # saturates, as a camera does
-        # A byte has 256 values, so all arithmetic goes into a table, (256, 1, 3).
+            levels = np.minimum(np.round(levels * gain), 255).astype(np.float32)  # saturates like a camera
+        # A byte has 256 values, so the normalisation is a table, (256, 1, 3).
         mean, std = np.array(manifest.mean, np.float32), np.array(manifest.std, np.float32)
         table = ((levels[:, None, None] * np.float32(1 / 255) - mean) / std).astype(np.float32)
         values = cv2.LUT(np.ascontiguousarray(rgb), table)
@@ -200,7 +200,7 @@ class DepthModel:
         return depth
 
     def _plane(self, values: Any, name: str) -> NDArray[np.float32]:
-        """Return an output without its axes of one element, (h, 2h)."""
+        """Return an output without its axes of length 1, (h, 2h)."""
         array = np.asarray(values)
         found = array.shape
         array = array.reshape([length for length in found if length != 1]).astype(np.float32)
@@ -209,7 +209,7 @@ class DepthModel:
         return array
 
     def _check_input(self) -> str:
-        """Check the network's inputs, and return the name of the image's."""
+        """Check the network's inputs, and return the name of the image input."""
         manifest, inputs = self.manifest, self.inputs
         size = [manifest.input_height, manifest.input_width]
         names = ", ".join(name for name, _, _ in inputs)
@@ -220,8 +220,8 @@ class DepthModel:
                                     f"the image's size (has: {names})")  # fmt: skip
             inputs = [one for one in inputs if one[0] != manifest.prior_input]
         if len(inputs) != 1:
-            raise ManifestError(f"{self._where}: takes {len(self.inputs)} inputs ({names}); only the image, and with "
-                                "prior_input incomplete depth, can be given")  # fmt: skip
+            raise ManifestError(f"{self._where}: takes {len(self.inputs)} inputs ({names}); allowed are the image and, "
+                                "with prior_input, incomplete depth")  # fmt: skip
         name, kind, shape = inputs[0]
         if kind != "tensor(float)" or not _fits(shape, [1, 3, *size]):
             raise ManifestError(f"{self._where}: input {name!r} is {kind} {shape}; the manifest says tensor(float) "
@@ -229,7 +229,7 @@ class DepthModel:
         return name
 
     def _check_outputs(self) -> list[str]:
-        """Check the network's outputs, and return the names of depth and standard deviation."""
+        """Check the network's outputs, and return the names of the depth and standard deviation outputs."""
         sigma, names = self.manifest.sigma_output, [name for name, _, _ in self.outputs]
         if sigma and sigma not in names:
             raise ManifestError(f"{self._where}: no output {sigma!r} for the sigma (has: {', '.join(names)})")
@@ -244,5 +244,5 @@ class DepthModel:
 
 
 def _fits(shape: list[Any], expected: list[int]) -> bool:
-    """Return whether a network's input shape, with text or None for open sizes, takes ``expected``."""
+    """Return whether a network's input shape, with text or None for free sizes, accepts ``expected``."""
     return len(shape) == 4 and all(not isinstance(a, int) or a == b for a, b in zip(shape, expected, strict=True))

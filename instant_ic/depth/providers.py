@@ -12,24 +12,24 @@ PROVIDERS = {
     "cuda": "CUDAExecutionProvider",
     "cpu": "CPUExecutionProvider",
 }
-"""Short name → onnxruntime's name, the fastest first."""
+"""Short name → onnxruntime's name, fastest first."""
 CHOICES = ("auto", *PROVIDERS)
 
 
 def open_session(model_file: Path, threads: int, provider: str = "auto") -> Any:
-    """Open a model; onnxruntime falls back along its list of providers, of which the CPU is the last.
+    """Open a model. If a provider fails, onnxruntime uses the next one; the last is the CPU.
 
     Args:
         model_file: ONNX file; weights in a file beside it (``external data``) are found.
         threads: CPU threads of one inference.
-        provider: first provider to try, or ``auto`` for the fastest that this onnxruntime has.
+        provider: first provider to try, or ``auto`` for the fastest provider of the installed onnxruntime.
 
     Returns:
         The ``onnxruntime.InferenceSession``.
 
     Raises:
-        ValueError: no such provider, or ``threads`` < 1.
-        Exception: onnxruntime's own, when not even the CPU can run the model.
+        ValueError: the provider is unknown, or ``threads`` < 1.
+        Exception: onnxruntime's error if not even the CPU can run the model.
     """
     import onnxruntime
 
@@ -59,14 +59,14 @@ def _session_options(threads: int) -> Any:
     options.intra_op_num_threads = threads
     options.inter_op_num_threads = 1
     options.use_deterministic_compute = True
-    # Idle workers sleep: the rest of the stack runs on the same cores.
+    # Idle workers must sleep, because the rest of the stack runs on the same cores.
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")
     options.log_severity_level = 3
     return options
 
 
 def _tensorrt_options() -> dict[str, str]:
-    cache = cache_dir() / "tensorrt"  # an engine takes minutes to build
+    cache = cache_dir() / "tensorrt"  # building an engine takes minutes
     cache.mkdir(parents=True, exist_ok=True)
     return {
         "trt_engine_cache_enable": "True", "trt_engine_cache_path": str(cache),

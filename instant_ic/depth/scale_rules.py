@@ -1,4 +1,4 @@
-"""Rules that find the scale between estimated depth and LiDAR ranges (paper, section IV.C). numpy only."""
+"""Rules that find the scale between estimated depth and LiDAR ranges (paper, section IV.C); needs only numpy."""
 
 from __future__ import annotations
 
@@ -12,17 +12,17 @@ MIN_VALUES = 20
 
 
 class ScaleError(ValueError):
-    """No scale can be found; the text says why."""
+    """No scale can be found; the message says why."""
 
 
 @dataclass(frozen=True)
 class Consensus:
-    """A scale that many pairs agree on.
+    """A scale on which many pairs of depth and range agree.
 
     Attributes:
         scale: metres per unit of depth.
-        share: share of the pairs that agree with it, 0..1.
-        rival_scale, rival_share: the next best scale that shares no pair with it; share 0 where there is none.
+        share: share of the pairs that agree with the scale, 0 to 1.
+        rival_scale, rival_share: the best scale among the other pairs, and its share; 0 if there is none.
     """
 
     scale: float
@@ -32,11 +32,11 @@ class Consensus:
 
 
 def max_ratio_scale(depth: Floats, range_m: Floats, confidence: float = 0.995) -> float:
-    """Scale that brings the largest depth to the largest range (paper, equation of section IV.C).
+    """Return the scale that maps the largest depth to the largest range (paper, equation of section IV.C).
 
     Args:
         depth: estimated depth, any shape and unit; values that are not positive and finite are left out.
-        range_m: LiDAR ranges in metres, any shape; likewise.
+        range_m: LiDAR ranges in metres, any shape; values that are not positive and finite are left out.
         confidence: quantile used as the maximum, which keeps outliers out.
 
     Returns:
@@ -51,7 +51,7 @@ def max_ratio_scale(depth: Floats, range_m: Floats, confidence: float = 0.995) -
 
 
 def log_ratios(depth: Floats, range_m: Floats) -> NDArray[np.float64]:
-    """Return log(range / depth) of pairs of one direction, (N,) each; pairs that are not positive are left out.
+    """Return log(range / depth) of pairs in the same direction, (N,) each; pairs that are not positive are left out.
 
     Raises:
         ScaleError: fewer than ``MIN_VALUES`` usable pairs.
@@ -62,15 +62,15 @@ def log_ratios(depth: Floats, range_m: Floats) -> NDArray[np.float64]:
 
 
 def consensus_scale(depth: Floats, range_m: Floats, tolerance: float = 0.15) -> Consensus:
-    """Scale that most pairs agree on within a factor 1 + ``tolerance``: RANSAC with every hypothesis, by sorting.
+    """Find the scale on which most pairs agree within a factor of 1 + ``tolerance``.
 
-    Then refined to the median of the pairs that agree. Pairs through glass or a mirror, and whatever else is far
-    off, have no say however far off they are.
+    This is RANSAC over all hypotheses, computed by sorting, and refined to the median of the agreeing pairs. Outliers,
+    such as pairs through glass or a mirror, have no influence, however far off they are.
 
     Args:
         depth: estimated depth, (N,).
         range_m: LiDAR ranges in the same directions, (N,).
-        tolerance: relative.
+        tolerance: largest relative difference of agreeing pairs.
 
     Raises:
         ScaleError: fewer than ``MIN_VALUES`` usable pairs.
@@ -84,7 +84,7 @@ def consensus_scale(depth: Floats, range_m: Floats, tolerance: float = 0.15) -> 
         centre = float(np.median(near))
     share = float((np.abs(ratios - centre) <= width / 2).mean())
     rival_scale, rival_share = np.exp(centre), 0.0
-    # More than a whole window away: the flanks of one crowd are no second one.
+    # Only pairs more than a window away count, because the pairs beside a peak are not a second peak.
     for others in (ratios[ratios < centre - width], ratios[ratios > centre + width]):
         if len(others):
             low, high = _fullest(others, width)
@@ -94,7 +94,7 @@ def consensus_scale(depth: Floats, range_m: Floats, tolerance: float = 0.15) -> 
 
 
 def _fullest(values: NDArray[np.float64], width: float) -> tuple[int, int]:
-    """Return the bounds of the window of this width that holds most of the sorted values (N,), N >= 1."""
+    """Return the bounds of the window of ``width`` that contains most of the sorted values (N,), N >= 1."""
     ends = np.searchsorted(values, values + width, side="right")
     first = int(np.argmax(ends - np.arange(len(values))))
     return first, int(ends[first])
@@ -103,19 +103,19 @@ def _fullest(values: NDArray[np.float64], width: float) -> tuple[int, int]:
 def sector_factors(
     azimuth_rad: Floats, log_ratio: Floats, sector_deg: float, trust_points: float
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Smooth factor over azimuth by which depth is still off in each direction.
+    """Return a smooth correction factor of the scaled depth over azimuth.
 
-    Each sector's median is shrunk to no correction by n / (n + ``trust_points``), then smoothed around the circle
-    with a Gaussian of half a sector's width: where there are few points or none, the global scale stays.
+    The logarithm of each sector's median is multiplied by n / (n + ``trust_points``), then smoothed around the circle
+    with a Gaussian of half a sector's width. In sectors with few or no points the global scale remains.
 
     Args:
         azimuth_rad: azimuth of the pairs, (N,).
         log_ratio: log of range over scaled depth of the pairs, (N,).
-        sector_deg: width of a sector, 360 is a multiple of it.
-        trust_points: number of points at which a sector's own median counts half.
+        sector_deg: width of a sector, a divisor of 360.
+        trust_points: number of points at which a sector's median has half weight.
 
     Returns:
-        Azimuths (K,) of the sectors' centres, rising in (-pi, pi), and log factors there (K,).
+        Azimuths (K,) of the sectors' centres, ascending in (-pi, pi), and log factors there (K,).
     """
     count = round(360.0 / sector_deg)
     sector = np.floor((np.asarray(azimuth_rad, np.float64) + np.pi) * (count / (2 * np.pi))).astype(np.intp) % count
@@ -133,5 +133,5 @@ def sector_factors(
 def _positive(values: Floats, name: str) -> Floats:
     usable = values[np.isfinite(values) & (values > 0)]
     if len(usable) < MIN_VALUES:
-        raise ScaleError(f"only {len(usable)} usable values of {name}, {MIN_VALUES} are needed")
+        raise ScaleError(f"only {len(usable)} usable values of {name}; {MIN_VALUES} are needed")
     return usable

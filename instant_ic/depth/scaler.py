@@ -1,4 +1,4 @@
-"""Scales estimated depth to metres by LiDAR ranges (paper, section IV.C). numpy only."""
+"""Scaling of estimated depth to metres by LiDAR ranges (paper, section IV.C); needs only numpy."""
 
 from __future__ import annotations
 
@@ -23,25 +23,26 @@ METHODS = ("max_ratio", "ransac", "sector", "as_estimated")
 OUTPUT_KINDS = ("metric", "scale_invariant")
 """``metric``: metres. ``scale_invariant``: metres up to one factor."""
 AGREEMENT = 0.15
-"""A point agrees with depth within this share of its range."""
-_CONFIDENCE = 0.995  # quantile that stands for the maximum, as in the paper
-_SECTOR_DEG, _SECTOR_POINTS = 15.0, 30.0  # width of a sector; points that give it half of its own correction
-_SECTOR_REACH = 0.35  # a point farther off than a factor e**0.35 has no say: glass, a doorway, an outlier
+"""Largest difference, as a share of the range, at which a point agrees with the depth."""
+_CONFIDENCE = 0.995  # quantile used as the maximum, as in the paper
+_SECTOR_DEG, _SECTOR_POINTS = 15.0, 30.0  # width of a sector; number of points at which its correction has half weight
+_SECTOR_REACH = 0.35  # points off by more than a factor e**0.35 do not count, such as glass, a doorway or an outlier
 
 
 @dataclass(frozen=True)
 class ScalerConfig:
-    """How depth is scaled.
+    """Parameters of the scaling of depth.
 
     Attributes:
-        method: sector, ransac, max_ratio (the paper's), as_estimated (not for driving).
+        method: sector, ransac, max_ratio (as in the paper) or as_estimated (not for driving).
         output_kind: kind of the model's output, as in its manifest: metric or scale_invariant.
         min_range_m: metres from the camera; nearer points (the robot itself) are left out.
-        max_range_m: metres; farther points are left out, farther depth is cut.
-        min_points: points on known depth; fewer give no scale.
-        min_quality: share of points that agree within 15 %; less and the fit is not trusted.
-        max_rival: another scale with more than this share of the scale's points: two fit, none is trusted.
-        min_scale, max_scale: a scale outside makes the fit not ok.
+        max_range_m: metres; farther points are left out, and larger depth is set to it.
+        min_points: smallest number of points on known depth that gives a scale.
+        min_quality: smallest share of points that agree within 15 %; a fit below it is not trusted.
+        max_rival: largest number of points that agree with another scale, relative to those of the found scale; above
+            it, two scales fit and none is trusted.
+        min_scale, max_scale: smallest and largest scale of a trusted fit.
         assumed_sigma: relative standard deviation published for depth that is used as estimated.
     """
 
@@ -62,9 +63,9 @@ class ScalerConfig:
                 raise ValueError(f"{key} must be one of {', '.join(allowed)} (got {getattr(self, key)!r})")
         check_ranges(self)
         if not self.min_range_m < self.max_range_m:
-            raise ValueError(f"min_range_m must be under max_range_m (got {self.min_range_m}, {self.max_range_m})")
+            raise ValueError(f"min_range_m must be below max_range_m (got {self.min_range_m}, {self.max_range_m})")
         if not self.min_scale < self.max_scale:
-            raise ValueError(f"min_scale must be under max_scale (got {self.min_scale}, {self.max_scale})")
+            raise ValueError(f"min_scale must be below max_scale (got {self.min_scale}, {self.max_scale})")
         if self.method == "as_estimated" and self.output_kind != "metric":
             raise ValueError(f"method as_estimated needs output_kind metric (got {self.output_kind!r})")
 
@@ -74,13 +75,13 @@ class ScaleFit:
     """Result of a fit.
 
     Attributes:
-        ok: false: do not trust ``depth_m``; ``message`` says why.
-        scale: metres per unit of the whole image's depth.
-        depth_m: (H, W) float32 scaled radial depth, 0 = unknown.
-        quality: share of points whose range agrees with the scaled depth, 0..1.
-        relative_sigma: one standard deviation of (depth - range) / range, robust; inf where nothing was compared.
+        ok: True if ``depth_m`` can be trusted; otherwise ``message`` says why not.
+        scale: metres per unit of depth, for the whole image.
+        depth_m: scaled radial depth in metres, (H, W) float32; 0 is unknown.
+        quality: share of points whose range agrees with the scaled depth, 0 to 1.
+        relative_sigma: robust standard deviation of (depth - range) / range; inf if nothing was compared.
         points: number of points compared.
-        message: for people.
+        message: text for the operator.
     """
 
     ok: bool
@@ -93,7 +94,7 @@ class ScaleFit:
 
 
 class DepthScaler:
-    """Fits estimated depth to LiDAR points of the same moment."""
+    """Fit of estimated depth to simultaneous LiDAR points."""
 
     def __init__(self, config: ScalerConfig | None = None) -> None:
         self.config = config or ScalerConfig()
@@ -102,18 +103,18 @@ class DepthScaler:
         """Scale one depth image.
 
         Args:
-            depth: (H, W) estimated radial depth, 0 = unknown.
-            points: (N, 3) LiDAR points in the camera's frame at the image's time, metres.
+            depth: estimated radial depth, (H, W); 0 is unknown.
+            points: LiDAR points in the camera's frame at the image's time in metres, (N, 3).
 
         Returns:
-            The fit; where no scale can be found ``ok`` is false, ``scale`` 1 and ``depth_m`` the depth as given
+            The fit. If no scale is found, ``ok`` is false, ``scale`` is 1, and ``depth_m`` is the given depth
             (``metric``) or all unknown (``scale_invariant``).
 
         Raises:
-            ValueError: the arrays have other shapes.
+            ValueError: the arrays have wrong shapes.
         """
         if depth.ndim != 2 or points.ndim != 2 or points.shape[1] != 3:
-            raise ValueError(f"depth must be (H, W), points (N, 3) (got {depth.shape}, {points.shape})")
+            raise ValueError(f"depth must be (H, W) and points (N, 3) (got {depth.shape}, {points.shape})")
         if self.config.method == "as_estimated":
             return self.as_estimated(depth)
         try:
@@ -122,14 +123,14 @@ class DepthScaler:
             return self.refuse(depth, str(error))
 
     def refuse(self, depth: Floats, message: str) -> ScaleFit:
-        """Return a fit that is not ok: depth (H, W) as the model gave it if that is metres, else all unknown."""
+        """Return a fit that is not ok, with the model's depth (H, W) if it is in metres, otherwise all unknown."""
         metric = self.config.output_kind == "metric"
         given = self._clean(depth) if metric else np.zeros(depth.shape, np.float32)
         return ScaleFit(False, 1.0, given, 0.0, float("inf"), 0, message)
 
     def as_estimated(self, depth: Floats) -> ScaleFit:
-        """Return depth (H, W) in the metres of a ``metric`` model as a fit that is ok, although it is not compared."""
-        message = "metres as estimated: the LiDAR was not asked (method as_estimated)"
+        """Return the depth (H, W) of a ``metric`` model as a fit that is ok, without comparing it to the LiDAR."""
+        message = "metres as estimated, not compared with the LiDAR (method as_estimated)"
         return ScaleFit(True, 1.0, self._clean(depth), 0.0, self.config.assumed_sigma, 0, message)
 
     def _fit(self, depth: Floats, points: Floats) -> ScaleFit:
@@ -165,7 +166,7 @@ class DepthScaler:
 
     def _check_points(self, count: int, where: str) -> None:
         if count < self.config.min_points:
-            raise ScaleError(f"{count} LiDAR points {where}, {self.config.min_points} are needed")
+            raise ScaleError(f"{count} LiDAR points {where}; {self.config.min_points} are needed")
 
     def _visible(self, points: Floats, height: int, width: int) -> tuple[NDArray[np.intp], NDArray[np.intp], Floats]:
         config = self.config
@@ -180,7 +181,7 @@ class DepthScaler:
     def _field(
         self, metres: Floats, rows: NDArray[np.intp], columns: NDArray[np.intp], range_m: Floats
     ) -> NDArray[np.float32]:
-        """Return the factor of each direction, (H, W), from the points near the scale; it goes to 1 at the poles."""
+        """Return the correction factor of each direction, (H, W), from points near the scale; it is 1 at the poles."""
         height, width = metres.shape
         ratio = np.log(range_m / metres[rows, columns])
         near = np.abs(ratio) <= _SECTOR_REACH
@@ -196,12 +197,12 @@ class DepthScaler:
         if not config.min_scale <= scale <= config.max_scale:
             return f"scale {scale:.3g} is outside {config.min_scale} to {config.max_scale}"
         if quality < config.min_quality:
-            return f"only {quality:.0%} of the points agree, {config.min_quality:.0%} are needed"
+            return f"only {quality:.0%} of the points agree; {config.min_quality:.0%} are needed"
         found = consensus_scale(scaled, range_m, AGREEMENT)
         if found.rival_share > config.max_rival * found.share:
             return (
-                f"two scales fit: {found.share:.0%} of the points stand for {scale * found.scale:.3g}, "
-                f"{found.rival_share:.0%} for {scale * found.rival_scale:.3g}"
+                f"two scales fit: {found.share:.0%} of the points agree with {scale * found.scale:.3g}, "
+                f"{found.rival_share:.0%} with {scale * found.rival_scale:.3g}"
             )
         return ""
 

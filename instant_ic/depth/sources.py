@@ -1,4 +1,4 @@
-"""Sources of depth: the network scaled by the LiDAR, the LiDAR alone, or both fused. Arrays in, arrays out."""
+"""Sources of depth: the network scaled by the LiDAR, the LiDAR alone, or the fusion of both."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ from instant_ic.mapping.mapper import LocalView
 
 Floats = NDArray[np.floating]
 Complete = Callable[[NDArray[np.float32]], tuple[NDArray[np.float32], NDArray[np.float32]]]
-"""Channels (6, H, W) (``depth.completion``) -> depth (H, W) in metres and relative sigma (H, W), of one image."""
+"""Completion of an image's depth: channels of ``depth.completion``, (6, H, W) → depth in metres and relative sigma."""
 SOURCES = ("network", "lidar", "fused", "completed")
-# Surfaces that the LiDAR has measured: upright ones with their continuation up and down, and a level ceiling.
+# Surfaces that count as measured by the LiDAR, including continued upright surfaces and a level ceiling.
 _MEASURED = (Origin.BEAM, Origin.BETWEEN, Origin.UP, Origin.DOWN, Origin.CEILING)
 _MEASURED_KINDS = (kernels.MEASURED, kernels.BETWEEN, kernels.UP, kernels.DOWN, kernels.CEILING)
 
@@ -34,12 +34,13 @@ class FusionTuning:
     """Tuning of the fusion.
 
     Attributes:
-        floor_sigma: relative standard deviation of the floor's depth under the robot; the camera's height is known to
-            centimetres.
-        network_sigma: the same of the network where nothing was measured, fitted on simulated rooms.
-        moved: a point nearer than the local model by this share belongs to something that has come since.
-        least_change: smallest relative change of a completion that is taken; smaller ones bend flat surfaces.
-        least_area: smallest width and height of such a change, in pixels; narrower ones are blur along edges.
+        floor_sigma: relative standard deviation of the floor's depth under the robot, because the camera's height is
+            known to centimetres.
+        network_sigma: relative standard deviation of the network's depth where nothing was measured, fitted on
+            simulated rooms.
+        moved: share of the depth by which a point must be nearer than the local model to belong to a new object.
+        least_change: smallest relative change that a completion may make; smaller changes bend flat surfaces.
+        least_area: smallest width and height of such a change, in pixels; narrower changes are blur along edges.
     """
 
     floor_sigma: float = 0.02
@@ -57,8 +58,8 @@ class SourceConfig:
     """Source of depth and its parameters.
 
     Attributes:
-        source: ``fused``: LiDAR and network; ``lidar``: no network; ``network``: scaled by the LiDAR; ``completed``:
-            ``fused``, corrected by a completion.
+        source: ``fused``: LiDAR and network; ``lidar``: LiDAR only; ``network``: network scaled by the LiDAR;
+            ``completed``: ``fused``, corrected by a completion model.
         scaler: parameters of the scaling of the network's depth.
         lidar: parameters of depth from points alone.
     """
@@ -75,13 +76,13 @@ class SourceConfig:
 
 @dataclass(frozen=True)
 class Prior:
-    """Input of a completion, and the pixels that it may not change.
+    """Input of a completion, and the pixels that the completion may not change.
 
     Attributes:
-        channels: (6, H, W), see ``depth.completion.prior_channels``.
-        free_m: (H, W) nothing stands nearer than this.
-        measured: (H, W) pixels whose depth the LiDAR has measured.
-        robot: (H, W) pixels that show the robot itself.
+        channels: result of ``depth.completion.prior_channels``, (6, H, W).
+        free_m: distance in metres up to which space is free, (H, W).
+        measured: pixels whose depth the LiDAR has measured, (H, W).
+        robot: pixels that show the robot itself, (H, W).
     """
 
     channels: NDArray[np.float32]
@@ -94,14 +95,14 @@ class Prior:
 class DepthResult(ScaleFit):
     """Depth of one image.
 
-    ``scale``, of the network, is 1 for ``lidar``. ``quality`` is the share of points whose range
-    agrees with the scaled network, before it is fused: how well image and LiDAR fit together; for ``lidar``, with
-    ``depth_m``, which has no lonely points in it. ``relative_sigma`` is the median of ``sigma`` over its known pixels.
+    ``scale`` is the network's, and 1 for ``lidar``. ``quality`` is the share of points whose range agrees with the
+    scaled network before the fusion, and shows how well image and LiDAR match. For ``lidar`` the points are compared
+    with ``depth_m``, which has no isolated points. ``relative_sigma`` is the median of ``sigma`` where it is known.
 
     Attributes:
-        sigma: (H, W) float32 relative standard deviation, inf where unknown.
+        sigma: relative standard deviation, (H, W) float32; inf is unknown.
         source: source of ``depth_m``.
-        prior: for :func:`complete`; None unless the source is ``completed`` and the result ok.
+        prior: input of :func:`complete`; None unless the source is ``completed`` and the result is ok.
     """
 
     sigma: NDArray[np.float32]
@@ -121,8 +122,10 @@ class DepthResult(ScaleFit):
 
 @dataclass(frozen=True)
 class _Built:
-    """Depth without a network, how far unknown pixels are free, which are measured, the revolution's structure, the
-    model's ceiling.
+    """Depth without a network.
+
+    ``free_m`` is the distance up to which unknown pixels are free. ``structure`` is that of the revolution, and
+    ``ceiling_m`` that of the local model.
     """
 
     depth_m: NDArray[np.float32]
@@ -134,7 +137,7 @@ class _Built:
 
 
 class DepthSource:
-    """Computes depth from an image's network estimate, simultaneous LiDAR points and the local model."""
+    """Computation of depth from the network's estimate, simultaneous LiDAR points and the local model."""
 
     def __init__(self, config: SourceConfig | None = None) -> None:
         self.configure(config or SourceConfig())
@@ -156,19 +159,19 @@ class DepthSource:
     ) -> DepthResult:
         """Compute the depth of one image.
 
-        ``fused`` and ``lidar`` take the local model first, then the structure of this revolution. In ``fused`` the
-        network fills what both leave unknown; it overrides nothing.
+        ``fused`` and ``lidar`` use the local model first, then the structure of this revolution. In ``fused`` the
+        network fills only pixels that both leave unknown.
 
         Args:
             raw: the network's depth in its own unit, (H, W); 0 is unknown. None only for ``lidar``.
-            points: LiDAR points in the camera's frame at the image's time, (N, 3) metres.
-            up: gravity's up in the camera's frame, (3,).
-            camera_height_m: height of the camera over the floor; None if it is unknown.
-            size: height and width of the result where there is no ``raw``; else it has the size of ``raw``.
+            points: LiDAR points in the camera's frame at the image's time in metres, (N, 3).
+            up: up direction (against gravity) in the camera's frame, (3,).
+            camera_height_m: height of the camera over the floor; None if unknown.
+            size: height and width of the result if ``raw`` is None; otherwise the result has the size of ``raw``.
             local: the local model, seen from the camera.
 
         Raises:
-            ValueError: arrays of other shapes, or no ``raw`` where the source needs it.
+            ValueError: arrays have wrong shapes, or ``raw`` is None and the source needs it.
         """
         config = self.config
         if config.source == "lidar":
@@ -192,7 +195,7 @@ class DepthSource:
         return replace(result, prior=Prior(channels, built.free_m, built.measured, robot))
 
     def _unfit(self, fit: ScaleFit, built: _Built) -> DepthResult:
-        """Return the LiDAR's depth, the better estimate, as unfit: LiDAR or network is wrong."""
+        """Return the LiDAR's depth as unfit, because LiDAR and network disagree and the LiDAR is more often right."""
         result, known = _of_fit(fit), built.depth_m > 0
         return replace(
             result,
@@ -204,7 +207,7 @@ class DepthSource:
         )
 
     def _fused(self, fit: ScaleFit, network: Corrected, built: _Built) -> DepthResult:
-        """Fill pixels that the LiDAR leaves unknown by the network, never nearer than free space."""
+        """Fill pixels that the LiDAR leaves unknown with the network's depth, but never nearer than free space."""
         known = built.depth_m > 0
         guess = np.maximum(network.depth_m, built.free_m)
         depth = np.where(known, built.depth_m, guess)
@@ -216,7 +219,7 @@ class DepthSource:
         )  # fmt: skip
 
     def refuse(self, raw: Floats | None, message: str, size: tuple[int, int] = (256, 512)) -> DepthResult:
-        """Return an unfit result for an image without points: ``raw`` if that is in metres, else all unknown."""
+        """Return an unfit result for an image without points: ``raw`` if it is in metres, otherwise all unknown."""
         if raw is not None:
             return replace(_of_fit(self.scaler.refuse(raw, message)), source=self.config.source)
         fit = ScaleFit(False, 1.0, np.zeros(size, np.float32), 0.0, float("inf"), 0, message)
@@ -225,7 +228,7 @@ class DepthSource:
     def network(
         self, fit: ScaleFit, points: Floats, up: Floats, camera_height_m: float | None
     ) -> tuple[Corrected, float | None]:
-        """Correct the scaled network by the points; return it and the height of its ceiling over the camera."""
+        """Correct the scaled network by the points. Return it with the height of its ceiling over the camera."""
         size = fit.depth_m.shape
         network = correct(fit.depth_m, self.structure.ranges(points, size))
         top = ceiling_height(network.depth_m, rays_of(size) @ np.asarray(up, np.float32))
@@ -238,7 +241,7 @@ class DepthSource:
         self, points: Floats, up: Floats, camera_height_m: float | None, size: tuple[int, int],
         local: LocalView | None, top: float | None,
     ) -> _Built:  # fmt: skip
-        """Build depth without a network: the local model, then this revolution's structure; ``top``: a ceiling."""
+        """Build depth without a network: local model, then this revolution's structure with a ceiling at ``top``."""
         seen = None if local is None else local.ceiling_m
         structure = self.structure.estimate(points, up, camera_height_m, size, top if seen is None else seen)
         depth, sigma, free = structure.depth_m, structure.sigma, np.zeros(size, np.float32)
@@ -248,11 +251,11 @@ class DepthSource:
             if ceiling is None and camera_height_m is not None:
                 ceiling = self.config.lidar.ceiling_height_m - camera_height_m
             modelled = local.render(size, ceiling)
-            # What this revolution measured plainly nearer has come since.
+            # Points of this revolution that are clearly nearer than the local model belong to new objects.
             hit = (structure.origin == Origin.BEAM) | (structure.origin == Origin.BETWEEN)
             come = hit & (depth < (1 - TUNING.moved) * modelled.depth_m)
             known = (modelled.depth_m > 0) & ~come
-            # A surface that the structure assumes in space that beams have passed is none.
+            # Discard surfaces that the structure assumes in space through which beams have passed.
             refuted = ~known & ~hit & (depth < modelled.free_m)
             depth = np.where(known, modelled.depth_m, np.where(refuted, np.float32(0), depth))
             sigma = np.where(known, modelled.sigma, np.where(refuted, np.float32(np.inf), sigma))
@@ -265,7 +268,7 @@ class DepthSource:
     ) -> DepthResult:
         built = self._built(points, up, camera_height_m, size, local, None)
         quality = agreement(built.depth_m, points, self.config.scaler)
-        message = f"LiDAR alone: {quality:.0%} of {built.structure.points} points on its surfaces; {_surfaces(built)}"
+        message = f"LiDAR only: {quality:.0%} of {built.structure.points} points on the surfaces; {_surfaces(built)}"
         return DepthResult(
             depth_m=built.depth_m,
             sigma=built.sigma,
@@ -280,12 +283,12 @@ class DepthSource:
 
 
 def complete(result: DepthResult, completion: Complete) -> DepthResult:
-    """Correct a result of the source ``completed``; needs no other state, so that any thread may do it.
+    """Correct a result of the source ``completed``. The function has no other state, so any thread may call it.
 
-    The completion changes the floor and assumed or guessed surfaces where it plainly contradicts them over an area,
-    but never to nearer than free space. Measured surfaces stay: there the LiDAR is better, and the completion bends
-    pillars and lowers bare ceilings. Without a prior, or if the completion fails, the result stays as it is; its
-    message gives the reason.
+    The completion changes the floor and assumed or estimated surfaces where it clearly contradicts them over an area,
+    but never to nearer than free space. Measured surfaces do not change, because the LiDAR is better there and the
+    completion bends pillars and lowers bare ceilings. Without a prior, or if the completion fails, the result does not
+    change. The message then gives the reason.
     """
     prior = result.prior
     if prior is None:
@@ -294,9 +297,9 @@ def complete(result: DepthResult, completion: Complete) -> DepthResult:
     try:
         found_m, found_sigma = completion(prior.channels)
         if found_m.shape != result.depth_m.shape:
-            raise ValueError(f"it is {found_m.shape}, the depth {result.depth_m.shape}")
+            raise ValueError(f"the completion is {found_m.shape}, the depth {result.depth_m.shape}")
     except (InferenceError, ValueError) as error:
-        return replace(result, message=f"{result.message}; no completion ({error})")
+        return replace(result, message=f"{result.message}; not completed ({error})")
     taken = np.isfinite(found_m) & (found_m > 0) & np.isfinite(found_sigma) & ~prior.measured & ~prior.robot
     taken = _areas(taken & _contradicts(found_m, prior.channels[0]))
     depth = np.where(taken, np.maximum(found_m, prior.free_m), result.depth_m).astype(np.float32)
@@ -306,27 +309,27 @@ def complete(result: DepthResult, completion: Complete) -> DepthResult:
 
 
 def _contradicts(found_m: Floats, prior_m: Floats) -> NDArray[np.bool_]:
-    """Return the pixels at which two depths (H, W) differ plainly, or there is no prior."""
+    """Return the pixels at which two depths (H, W) clearly differ, or the prior is unknown."""
     known = (prior_m > 0) & (found_m > 0)
     change = np.abs(np.log(np.where(known, found_m, 1) / np.where(known, prior_m, 1)))
     return ~known | (change > TUNING.least_change)
 
 
 def _areas(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Return the parts of a panorama's mask (H, W) that are not narrow."""
+    """Return a panorama's mask (H, W) without its narrow parts."""
     width = TUNING.least_area
     around = np.pad(mask.astype(np.uint8), ((0, 0), (width, width)), mode="wrap")
     return cv2.morphologyEx(around, cv2.MORPH_OPEN, np.ones((width, width), np.uint8))[:, width:-width] > 0
 
 
 def without_body(result: DepthResult, up: Floats, camera_height_m: float | None, elevation_deg: float) -> DepthResult:
-    """Replace the robot itself, which fills the image below an elevation, by floor.
+    """Replace the robot itself, which the image shows below an elevation, by floor.
 
     Args:
-        result: depth (H, W).
-        up: (3,) gravity's up in the camera's frame.
+        result: depth of the image.
+        up: up direction (against gravity) in the camera's frame, (3,).
         camera_height_m: height of the camera over the floor; None leaves masked pixels unknown.
-        elevation_deg: below it the image shows the robot; -90 masks nothing.
+        elevation_deg: elevation below which the image shows the robot; -90 masks nothing.
     """
     rise = rays_of(result.depth_m.shape) @ np.asarray(up, np.float32)
     body = rise < np.sin(np.radians(elevation_deg))
@@ -340,7 +343,7 @@ def without_body(result: DepthResult, up: Floats, camera_height_m: float | None,
 
 
 def agreement(depth_m: Floats, points: Floats, config: ScalerConfig) -> float:
-    """Return the share of points (N, 3) within ``AGREEMENT`` of the depth (H, W) at their pixels."""
+    """Return the share of points (N, 3) that agree with the depth (H, W) at their pixels within ``AGREEMENT``."""
     points = points[np.isfinite(points).all(axis=1)]
     rows, columns, range_m = nearest_points(points, depth_m.shape[1], depth_m.shape[0])
     inside = (range_m >= config.min_range_m) & (range_m <= config.max_range_m)

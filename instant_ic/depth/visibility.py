@@ -1,4 +1,4 @@
-"""Visibility of LiDAR points from the camera, which is mounted elsewhere, and their pixels. numpy only."""
+"""Visibility of LiDAR points from the camera, which is mounted elsewhere, and their pixels; needs only numpy."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def pixels_of(points: Floats, width: int, height: int) -> tuple[Indices, Indices
 def nearest_points(points: Floats, width: int, height: int) -> tuple[Indices, Indices, Floats]:
     """Return rows, columns and ranges of the nearest point in each pixel that has one.
 
-    Of two points in one pixel the nearer is the one that the camera sees.
+    The camera sees only the nearest of several points in one pixel.
     """
     rows, columns, range_m = pixels_of(points, width, height)
     pixel = rows * width + columns
@@ -35,11 +35,11 @@ def nearest_points(points: Floats, width: int, height: int) -> tuple[Indices, In
 def hidden(points: Floats, margin: float = 0.25, cell_deg: float = CELL_DEG) -> NDArray[np.bool_]:
     """Return a mask (N,) of the points (N, 3) in the camera's frame that the camera probably does not see.
 
-    A point is hidden when two others in its own or in one of the eight neighbouring cells of ``cell_deg`` are nearer
-    by more than ``margin`` of the range; one alone may be an outlier. Rings lie two degrees apart, so one pixel alone
-    would let the wall behind a table show between two rings on its top. On a floor seen from 1.2 m the range changes
-    by less than that from cell to cell up to about 7 m; farther out some visible points are lost, which costs nothing
-    but points.
+    A point is hidden if two others, in the same or one of the eight neighbouring cells of ``cell_deg``, are nearer by
+    more than ``margin`` of its range; a single one may be an outlier. Neighbouring cells count because rings are two
+    degrees apart: otherwise the wall behind a table would be visible between two rings on the table's top. On a floor
+    seen from 1.2 m, the range changes by less than the margin per cell up to about 7 m. Farther away some visible
+    points are lost, which is acceptable.
     """
     height = max(round(180.0 / cell_deg), 1)
     rows, columns, range_m = pixels_of(points, 2 * height, height)
@@ -55,17 +55,17 @@ def hidden(points: Floats, margin: float = 0.25, cell_deg: float = CELL_DEG) -> 
 
 
 def azimuth_problem(columns: Indices, width: int) -> str:
-    """Return an error text if points in these columns (N,) cover too little azimuth; else an empty one."""
+    """Return an error text if points in these columns (N,) cover too little azimuth; otherwise an empty text."""
     covered = len(np.unique(columns * 120 // width)) * 3.0
     if covered >= _LEAST_AZIMUTH_DEG:
         return ""
-    return f"LiDAR points cover {covered:.0f} deg of azimuth, {_LEAST_AZIMUTH_DEG:.0f} are needed"
+    return f"LiDAR points cover {covered:.0f} deg of azimuth; {_LEAST_AZIMUTH_DEG:.0f} are needed"
 
 
 def on_depth_edge(depth: Floats, rows: Indices, columns: Indices, ratio: float = 1.25) -> NDArray[np.bool_]:
-    """Return a mask (N,) of pixels around which known depth (H, W) differs by more than ``ratio``, in 3 x 3 pixels.
+    """Return a mask (N,) of pixels in whose 3 x 3 neighbourhood known depth (H, W) differs by more than ``ratio``.
 
-    There a point may belong to either side, and a network's edge is blurred or a pixel off.
+    At such an edge a point may belong to either side, and a network's edge is blurred or off by a pixel.
     """
     height, width = depth.shape
     around = np.stack(

@@ -71,7 +71,7 @@ def test_failing_gpu_is_left_for_the_cpu(config: DepthEstimatorConfig) -> None:
         bus.publish(TOPIC, compressed_image_message(picture(), "camera", START), stamp_ns=START)
         level, message, values = node.diagnoses()["depth"]
         assert (level, values["failures"]) == (2, 1)
-        assert message == "tiny on cuda: out of memory; going on with the CPU"
+        assert message == "tiny on cuda: out of memory; the CPU is used from now on"
         bus.publish(TOPIC, compressed_image_message(picture(), "camera", START + S), stamp_ns=START + S)
         assert len(bus.messages("/depth/raw")) == 1
         assert [info.provider for info in bus.messages("/depth/model")] == ["cpu", "cpu"]
@@ -128,7 +128,7 @@ def test_a_hanging_inference_ends_the_process(
         node.inference.model = hanging = Hanging(node.inference.model.manifest, obeys=False)
         with caplog.at_level(logging.ERROR):
             bus.publish(TOPIC, compressed_image_message(picture(), "camera", START), stamp_ns=START)
-        assert node.stopping and hanging.cancelled > 1 and "hangs: the node ends for a restart" in caplog.text
+        assert node.stopping and hanging.cancelled > 1 and "hangs; the node ends so that it is restarted" in caplog.text
         hanging.go_on.set()
 
 

@@ -56,7 +56,7 @@ def _bad(tmp_path, name):
 
 BAD = {
     "missing.npy": "No such file",
-    "depth.pfm": "read from",
+    "depth.pfm": "depth files must be",
     "colour.png": "got 3 of 16",
     "junk.npy": "not a readable numpy",
     "nan.npy": "no known depth",

@@ -362,7 +362,7 @@ def test_a_silent_network_is_told() -> None:
         node = bus.add(DepthScalerNode)
         drive(bus, 12.7, network=False, lidar=False)
         severity, words = level(node, "scale")
-    assert severity == 1 and "no /depth/raw for 12 s" in words and "source lidar" in words
+    assert severity == 1 and "no /depth/raw for 12 s" in words and "source to lidar" in words
 
 
 def test_the_models_own_word_of_its_output_counts() -> None:

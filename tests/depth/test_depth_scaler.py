@@ -67,7 +67,7 @@ def test_depth_as_estimated_is_told_as_such_and_asks_no_points() -> None:
     fit = DepthScaler(config).fit(depth, room_points(noise=0.0))
     assert (fit.ok, fit.scale, fit.points, fit.quality, fit.relative_sigma) == (True, 1.0, 0, 0.0, 0.3)
     np.testing.assert_array_equal(fit.depth_m, np.minimum(depth, 16.0).astype(np.float32))
-    assert "LiDAR was not asked" in fit.message
+    assert "not compared with the LiDAR" in fit.message
     assert ScalerConfig().method != "as_estimated"
     assert not DepthScaler().fit(depth, np.zeros((0, 3))).ok
     with pytest.raises(ValueError, match="as_estimated needs output_kind metric"):

@@ -167,7 +167,7 @@ def test_what_is_not_to_be_trusted_says_why() -> None:
     assert "20 LiDAR points" in STRUCTURE.estimate(POINTS[:20], UP, CAMERA_M, SIZE).message
     azimuth = np.degrees(np.arctan2(POINTS[:, 1], POINTS[:, 0]))
     narrow = STRUCTURE.estimate(POINTS[np.abs(azimuth) < 30], UP, CAMERA_M, SIZE)
-    assert "deg of azimuth, 90 are needed" in narrow.message
+    assert "deg of azimuth; 90 are needed" in narrow.message
     low = STRUCTURE.estimate(POINTS, UP, 0.7, SIZE)
     assert "lie under the floor (0.70 m under the camera)" in low.message
     with pytest.raises(ValueError, match=r"points must be \(N, 3\)"):
@@ -176,7 +176,7 @@ def test_what_is_not_to_be_trusted_says_why() -> None:
         STRUCTURE.estimate(POINTS, -UP)
     with pytest.raises(ValueError, match="three finite numbers"):
         STRUCTURE.estimate(POINTS, np.full(3, np.nan))
-    with pytest.raises(ValueError, match="min_range_m must be under max_range_m"):
+    with pytest.raises(ValueError, match="min_range_m must be below max_range_m"):
         LidarDepthConfig(min_range_m=3, max_range_m=2)
 
 
@@ -403,4 +403,4 @@ def test_failed_completion_leaves_the_fused_depth(error: Exception) -> None:
     np.testing.assert_array_equal(found.depth_m, before.depth_m)
     assert found.ok and str(error) in found.message and found.prior is None
     small = complete(before, lambda channels: (np.ones((8, 16)), np.ones((8, 16))))
-    assert "it is (8, 16), the depth (96, 192)" in small.message
+    assert "the completion is (8, 16), the depth (96, 192)" in small.message

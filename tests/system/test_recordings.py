@@ -47,8 +47,8 @@ def test_capture_becomes_scans_at_its_own_pace_and_a_map(summary: dict[str, Any]
 
 def test_summary_says_that_the_depth_was_not_scaled(summary: dict[str, Any]) -> None:
     assert summary["depth_fit"] and summary["depth_scale"] == 1.0
-    assert "LiDAR was not asked" in summary["depth_message"]
-    assert "LiDAR was not asked" in summary["depth_from"]
+    assert "not compared with the LiDAR" in summary["depth_message"]
+    assert "not compared with the LiDAR" in summary["depth_from"]
 
 
 def test_virtual_space_looks_like_the_photo(summary: dict[str, Any]) -> None:
