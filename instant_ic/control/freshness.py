@@ -44,7 +44,7 @@ class TimeoutConfig(Checked):
         estop_input: s; ``/robot/estop``, from a button that repeats its state; 0: the button reports only changes.
         vspace: s; ``/vspace/status``.
         late_s: seconds after its usual arrival at which an image counts as late.
-        slowest_image_s: longest period of images in seconds at which the robot starts.
+        slowest_image_s: longest period of images in seconds at which the robot starts; an age of 2 s counts as a pause.
         image_travel_m: largest distance in metres driven before a missing image stops the robot; limits the speed at
             low image rates.
         stop_after_s: seconds of silence that lead to STOPPED.
@@ -63,7 +63,7 @@ class TimeoutConfig(Checked):
     estop_input: Annotated[float, Plausible(0, 10)] = 0.0
     vspace: _ImageTimeout = 2.0
     late_s: Annotated[float, Plausible(0.01, 2)] = 0.1
-    slowest_image_s: _ImageTimeout = 1.1
+    slowest_image_s: Annotated[float, Plausible(0.05, 1.5)] = 1.1
     image_travel_m: Annotated[float, Plausible(0.02, 2)] = 0.33
     stop_after_s: Annotated[float, Plausible(0.1, 10)] = 1.5
     recover_s: Annotated[float, Plausible(0.05, 10)] = 0.5

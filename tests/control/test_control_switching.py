@@ -398,6 +398,16 @@ def test_the_way_back_does_not_lead_through_a_wall() -> None:
     np.testing.assert_allclose(vbot.pose, robot, atol=0.01)
 
 
+def test_the_slowest_images_that_may_be_set_have_a_known_rhythm() -> None:
+    """An age of 2 s counts as a pause; images that rare would keep the robot from starting, whatever is allowed."""
+    with pytest.raises(ValueError, match="slowest_image_s"):
+        TimeoutConfig(slowest_image_s=1.6)
+    slowest, rhythm = TimeoutConfig(slowest_image_s=1.5).slowest_image_s, Rhythm()
+    for _ in range(5):
+        rhythm.heard(1.25 * slowest)
+    assert math.isfinite(rhythm.usual_s)
+
+
 def test_a_source_is_late_by_its_own_rhythm() -> None:
     timeouts, rhythm = TimeoutConfig(), Rhythm()
     assert timeouts.allowed_s("camera", rhythm.usual_s) == pytest.approx(0.625)  # not known yet
