@@ -70,9 +70,7 @@ class CrawlerBaseNode(Node[CrawlerBaseConfig]):
         self.loop = loop_class(self.controller, config.rate_hz, self.on_step, self.on_end)
         if self.lockstep:
             self.timer(1.0 / config.rate_hz, self.loop.hurry)
-        self.state = self.latest(
-            "/ic/state", ControlState, STATE_S, LATCHED
-        )  # names the node that may release the emergency stop
+        self.state = self.latest("/ic/state", ControlState, STATE_S, LATCHED)  # who may release the emergency stop
         self.subscribe_received("/operator/estop", self.on_estop, qos=LATCHED, message_class=Bool)
         self.subscribe_received("/robot/estop", self.on_button, qos=LATCHED, message_class=Bool)
         self.subscribe_received("/cmd_vel", self.on_command, qos=SENSOR)

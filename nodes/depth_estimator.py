@@ -61,9 +61,7 @@ class DepthEstimatorNode(Node[DepthEstimatorConfig]):
             raise NodeError(str(error)) from error
         self.newest: Any = None  # newest image
         self.last_ns: int | None = None
-        self.wanted_ns = (
-            -math.inf
-        )  # stamp from which an image is wanted: -inf before the first request, inf if none is pending
+        self.wanted_ns = -math.inf  # images from this stamp on are wanted; -inf before any request, inf without one
         self.failures = 0
         self.depth = self.publisher("/depth/raw", Image, qos=SENSOR)
         self.info = self.publisher("/depth/model", DepthModelInfo, qos=LATCHED)

@@ -83,9 +83,7 @@ class DepthScalerNode(Node[DepthScalerConfig]):
         due = self.chain.due(image)
         if due and self.config.source == "lidar":
             self.handle(self.chain.hold(image))
-        elif (
-            due and not self.worker.busy and self.chain.request_due(image.stamp_ns)
-        ):  # else a keyframe may be on its way
+        elif due and not self.worker.busy and self.chain.request_due(image.stamp_ns):  # else one may be on its way
             self.request.publish(header(image.frame, image.stamp_ns))
 
     def on_cloud(self, message: Any) -> None:

@@ -115,9 +115,7 @@ class BaseController:
         pulse_m = 1.0 / config.geometry.pulses_per_metre
         self._watch = TrackWatch(self._fastest_m_s, pulse_m, simulated=not current().real)
         self._watched: tuple[NDArray[np.int64], int] | None = None  # last counts judged by the watch, and their time
-        self._sent: tuple[NDArray[np.float64], int] | None = (
-            None  # track speeds, and time up to which the watch knows them
-        )
+        self._sent: tuple[NDArray[np.float64], int] | None = None  # track speeds, and the end of their last report
         self._last_step_ns: int | None = None
         self._placed_ns: int | None = None  # time of the last reading used for odometry
         self._next_health_ns = 0

@@ -48,9 +48,8 @@ class Callbacks:
             function, args = self.soon.popleft()
             label = getattr(function, "__qualname__", "callback")
             self.run(label, function, *args)
-            self._failed_at.pop(
-                label, None
-            )  # a function runs once, so a later success of another one must not clear the diagnosis
+            # The function runs only once, so a later success under its label must not clear the diagnosis.
+            self._failed_at.pop(label, None)
             ran = True
         return ran
 

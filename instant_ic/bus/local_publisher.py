@@ -232,9 +232,8 @@ class LocalPublisher:
     def _read_by_all(self) -> tuple[int, int]:
         """Return the newest sequence that every lossless reader has looked at, and the newest that every reader has."""
         must = self.sequence
-        should = (
-            must if self.subscriber_count <= len(self._progress) else 0
-        )  # a reader without an announcement is unknown
+        # The progress of a reader without an announcement is unknown.
+        should = must if self.subscriber_count <= len(self._progress) else 0
         for progress in self._progress.values():
             sequence = progress.sequence()
             should = min(should, sequence)

@@ -132,9 +132,8 @@ class LocalSubscription:
                 except zmq.ZMQError as error:
                     self._complain(source.address, f"{source.address} cannot be connected: {error}")
                     continue
-            self.sources[identity] = (
-                source  # its messages are accepted from now on, even after it has left the registry
-            )
+            # Messages of this publisher are accepted from now on, even after it has left the registry.
+            self.sources[identity] = source
         for identity, source in self.sources.items():
             source.left_s = 0.0 if identity in present else source.left_s or time.monotonic()
 

@@ -124,9 +124,7 @@ class LocalTransport(Host):
             os.close(self._poke)
         started_s = time.monotonic()
         self.context.term()
-        if (
-            time.monotonic() - started_s > LINGER_S / 2
-        ):  # readers cannot detect the loss, as no later message shows a gap
+        if time.monotonic() - started_s > LINGER_S / 2:  # no later message will show the gap to the readers
             log.warning("%s closed, but a reader was too slow: its last messages are lost", self.node)
 
     # -- reading ---------------------------------------------------------------------------------
