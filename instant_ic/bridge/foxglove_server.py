@@ -196,7 +196,7 @@ class FoxgloveServer:
         try:
             listening = self._loop.create_server(self._server, config.host, config.port)
             self._listener = self._loop.run_until_complete(listening)
-        except OSError as error:
+        except (OSError, ValueError) as error:  # ValueError: the host is no name
             self._loop.close()
             raise FoxgloveError(f"no server on {config.host}:{config.port}: {error}; set host or port") from None
         self.port: int = self._listener.sockets[0].getsockname()[1]

@@ -184,7 +184,7 @@ class ConsoleServer(PageServer):
     def _run(self) -> None:
         try:
             asyncio.run(self._serve())
-        except OSError as error:
+        except (OSError, ValueError) as error:  # ValueError: the host is no name
             self._start_error = error
         finally:
             self._started.set()

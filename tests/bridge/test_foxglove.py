@@ -338,6 +338,13 @@ def test_a_port_in_use_is_reported(tmp_path_factory):
             )
 
 
+def test_a_host_that_is_no_name_is_reported(tmp_path_factory):
+    with pytest.raises(NodeError, match=r"no server on aaa.*set host or port"):
+        LiveNode(
+            tmp_path_factory.mktemp("r"), FoxgloveBridgeNode, FoxgloveBridgeConfig(host=70 * "a"), "foxglove_bridge"
+        )
+
+
 # -- against foxglove-sdk's own server -----------------------------------------------------------------
 
 

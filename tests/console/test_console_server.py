@@ -335,3 +335,8 @@ def test_used_port_is_told(serve):
     server = serve()
     with pytest.raises(ConsoleError, match=f"{server.port}.*server.port"):
         ConsoleServer(Backend(), ConsoleServerConfig(port=server.port)).start()
+
+
+def test_a_host_that_is_no_name_is_told():
+    with pytest.raises(ConsoleError, match="cannot listen on aaa"):
+        ConsoleServer(Backend(), ConsoleServerConfig(host=70 * "a", port=0)).start()
