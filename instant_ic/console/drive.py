@@ -320,7 +320,10 @@ class DriveService:
                 delay = None if deadline is None else max(pace.wait_s(deadline - pace.steady_s()), 0.001)
                 await asyncio.wait_for(self._wake.wait(), delay)
                 continue  # woken: the deadline may have changed
-            self.settle()
+            try:
+                self.settle()
+            except Exception:  # the watchdog must outlive an error of the backend
+                logger.exception("a drive command could not be published")
 
     def settle(self) -> None:
         """Publish the command that is due, and report what has changed."""

@@ -1,9 +1,13 @@
 """Lease, watchdog and emergency stop, by a clock that the test sets."""
 
-import pytest
+import asyncio
 
-from instant_ic.console.drive import DriveConfig, DriveGate
+import pytest
+from console_servers import Backend
+
+from instant_ic.console.drive import DriveConfig, DriveGate, DriveService
 from instant_ic.control.robot_lease import Verdict
+from instant_ic.util.pace import current
 
 CONFIG = DriveConfig(max_linear_mps=0.4, max_angular_rps=0.8, rate_hz=20, watchdog_s=0.25, stop_repeat_s=0.3)
 
@@ -292,3 +296,21 @@ def test_what_a_thawed_console_handles_first_does_not_matter(first):
     assert look_and_drive(gate, now + 0.6, 102) is Verdict.HELD  # silence is no release: no page was heard
     gate.touch(1, now + 0.7)
     assert look_and_drive(gate, now + 0.86, 103) is Verdict.ACCEPTED
+
+
+async def test_the_watchdog_outlives_an_error_of_the_bus(monkeypatch):
+    backend, failed = Backend(), asyncio.Event()
+    service = DriveService(backend, DriveConfig())
+    service.gate.request(1, current().steady_s())
+    service.command(1, 1, 0.0, 0.3, 0.0, current().steady_s())
+
+    def fail(linear, angular):
+        failed.set()
+        raise RuntimeError
+
+    with monkeypatch.context() as broken:
+        broken.setattr(backend, "on_drive", fail)
+        running = asyncio.create_task(service.run())
+        await failed.wait()
+    await backend.wait(lambda backend: backend.commands[-1] == (0.0, 0.0) and backend.operator[-1:] == [False])
+    running.cancel()
