@@ -1,4 +1,4 @@
-"""Decides which robot the operator drives; the only publisher of /cmd_vel (paper, III.A)."""
+"""Decides which robot the operator drives, as the only publisher of /cmd_vel (paper, III.A)."""
 
 from __future__ import annotations
 

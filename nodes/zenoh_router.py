@@ -14,8 +14,8 @@ class ZenohRouterConfig:
     """Parameters.
 
     Attributes:
-        listen: endpoints to listen on; empty: those of the session file.
-        session_file: Zenoh configuration (JSON5), a path or a file of config/; empty: tcp/localhost:7447, open to all.
+        listen: endpoints to listen on; empty uses those of the session file.
+        session_file: Zenoh configuration (JSON5), as a path or a file of config/; empty opens tcp/localhost:7447 to all.
     """
 
     listen: tuple[str, ...] = ()

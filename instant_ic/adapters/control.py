@@ -149,7 +149,7 @@ class ArbiterInbox:
         return (new and mode in (Mode.ENTERING, Mode.RETURNING)) or (self._was_gone and not before)
 
     def update_costmap(self, static: StaticMap | None) -> Any:
-        """Take the newest scan and points into the costmap; return its message if it is due, else None."""
+        """Enter the newest scan and points into the costmap. Return its message if it is due, else None."""
         scan = self.scan()
         costmap = self.surroundings.update_costmap(scan, self.cloud(), static)
         if costmap is None or scan is None or not self.surroundings.publish_due(self.clock.steady_ns()):

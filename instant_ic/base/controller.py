@@ -223,7 +223,7 @@ class BaseController:
         return True
 
     def _fresh_command(self) -> _Command | None:
-        """Return the current command if it is fresh; discard a stale command, so that it never becomes fresh again."""
+        """Return the current command if it is fresh. Discard a stale command, so that it never becomes fresh again."""
         with self._lock:
             command = self._command
             if command is not None:

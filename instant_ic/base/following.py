@@ -27,7 +27,7 @@ _MISSING_M, _MISSING_SIMULATED_M = 0.02, 0.04
 _MOST_SIMULATED_S = 0.05
 """Longest time between two readings that counts in simulation, in seconds: it may have paused for the rest."""
 _CHANGING_S = 0.25
-"""Time by which the change of a command extends the missing motion allowed, because power first brakes a track."""
+"""Missing motion allowed after a change of the command, as time at the change's speed: power first brakes a track."""
 _LAG_S, _RECENT_S = 0.1, 0.3
 """Time constants from a command to its motion, and for forgetting a change of the command, in seconds."""
 _BLANKED_POWER = 0.2

@@ -37,12 +37,12 @@ class Callbacks:
         self._faults = 0
 
     def call_soon(self, function: Callable[..., None], *args: Any) -> None:
-        """Run a function on the node's thread; may be called from any thread."""
+        """Run a function on the node's thread. Any thread may call this."""
         self.soon.append((function, args))
         self._wake()
 
     def run_soon(self) -> bool:
-        """Run the functions of :meth:`call_soon`; return whether there were any."""
+        """Run the functions passed to :meth:`call_soon`. Return whether there were any."""
         ran = False
         while self.soon:
             function, args = self.soon.popleft()
@@ -85,6 +85,6 @@ class Callbacks:
             raise error
 
     def activity(self) -> tuple[str, float]:
-        """Return the running callback, and for how many seconds it has run; ("", 0) when the node is idle."""
+        """Return the running callback and its running time in seconds, or ("", 0) if the node is idle."""
         running = self._running
         return ("", 0.0) if running is None else (running[0], time.monotonic() - running[1])

@@ -115,8 +115,7 @@ class Node(Generic[ConfigT]):
         ``super()``.
 
         Raises:
-            ValueError: the values cannot be used; nothing has been changed.
-            NodeError: likewise.
+            ValueError, NodeError: the values cannot be used; nothing has been changed.
         """
         self.config = config
 

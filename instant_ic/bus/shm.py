@@ -150,7 +150,7 @@ class Slot(Memory):
         fcntl.flock(self.fd, fcntl.LOCK_UN)
 
     def begin(self, size: int) -> memoryview:
-        """Return memory for the next message of ``size`` bytes. The previous one becomes invalid; hold the lock."""
+        """Return memory for the next message of ``size`` bytes, under the lock. The previous one becomes invalid."""
         self.finish(0)
         return memoryview(self.map)[_PAYLOAD_AT : _PAYLOAD_AT + size]
 

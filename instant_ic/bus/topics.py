@@ -10,7 +10,7 @@ from instant_ic.bus.transport import Buffer, RawPublisher, RawSubscription, Rece
 from instant_ic.msg import MessageError, serializer, stamp_ns, type_name
 
 WENT_BACK_NS = 100_000_000
-"""Step back in time that counts as jitter. At a larger one, the clock was set back or restarted."""
+"""Largest step back in time that counts as jitter. At a larger step, the clock was set back or restarted."""
 
 
 class Publisher:

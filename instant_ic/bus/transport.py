@@ -95,7 +95,7 @@ class Stats:
         return (len(recent) - 1) * 1e9 / span
 
     def age_s(self, now_ns: int) -> float:
-        """Return the seconds since the newest message; inf before the first, and after simulated time went back."""
+        """Return the seconds since the newest message; inf before the first and after simulated time went back."""
         age = (now_ns - self.newest_ns) / 1e9
         return age if self.count and age >= -_TOLERANCE_S else float("inf")
 

@@ -290,7 +290,7 @@ def _required(config_class: type[Any]) -> set[str]:
 
 
 class _RefusedError(ValueError):
-    """A value is refused; the message says why."""
+    """A value is refused."""
 
 
 class _UnknownError(_RefusedError):

@@ -62,7 +62,7 @@ def header(frame_id: str, stamp: int) -> Any:
 
 
 def image_message(array: NDArray[Any], encoding: str, frame_id: str, stamp: int) -> Any:
-    """Return a sensor_msgs/Image from an array (H, W) or (H, W, C); a contiguous array is not copied.
+    """Return a sensor_msgs/Image from an array (H, W) or (H, W, C). A contiguous array is not copied.
 
     Raises:
         MessageError: the encoding is unknown, or the array's shape or dtype does not fit it.

@@ -101,7 +101,7 @@ class GridSlam:
 
     Attributes:
         map: the map being made.
-        in_map_frame: False until the robot has first been located in a saved map; its poses are then not in the map.
+        in_map_frame: whether poses are in the map's frame; False until the robot is first located in a saved map.
         frames: poses in the map and in odometry.
         front_end: matches scans and makes keyframes.
         loop_closure: finds loops and optimises the keyframes' poses.
