@@ -15,7 +15,7 @@ class ZenohRouterConfig:
 
     Attributes:
         listen: endpoints to listen on; empty uses those of the session file.
-        session_file: Zenoh configuration (JSON5), as a path or a file of config/; empty opens tcp/localhost:7447 to all.
+        session_file: Zenoh configuration (JSON5), a path or a file of config/; empty opens tcp/localhost:7447 to all.
     """
 
     listen: tuple[str, ...] = ()
