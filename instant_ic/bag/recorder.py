@@ -213,6 +213,8 @@ class Recorder:
         Raises:
             BagError: a bag could not be written completely.
         """
+        for bag in self._bags:  # all at once: the launcher waits for 5 s, and a snapshot may take longer
+            bag.finish(report=False)
         errors = []
         for bag in self._bags:
             try:

@@ -466,3 +466,28 @@ def test_a_recorder_of_one_bag_refuses_requests(tmp_path: Path) -> None:
         with pytest.raises(ValueError, match="start it with --snapshot"):
             request()
     recorder.close()
+
+
+def test_a_snapshot_that_takes_long_holds_up_the_end_of_no_recording(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    go = threading.Event()
+
+    def make_folder(path: Path) -> None:
+        if "slow" in path.name:
+            go.wait(20)
+        path.mkdir(parents=True)
+
+    monkeypatch.setattr("instant_ic.bag.writer.make_folder", make_folder)
+    recorder = recorder_of(tmp_path / "bags", snapshot=True)
+    recorder.record()
+    recorder.take("/scan", BOOL, b"1", 1 * S)
+    slow = recorder.snapshot("slow")
+    closing = threading.Thread(target=recorder.close)
+    closing.start()
+    assert recorder.bag is not None
+    wait_for(lambda: recorder.bag and recorder.bag.done, "the end of the recording")
+    assert not slow.done and read(recorder.bag.path) == [("/scan", 1 * S, b"1")]
+    go.set()
+    closing.join()
+    assert not recorder.failed
