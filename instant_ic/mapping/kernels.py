@@ -183,7 +183,7 @@ def _runs_along(key, sums, a, b, cell, dx, dy, moments):  # type: ignore[no-unty
 def ceiling_levels(key, odds, last, now, keep, centre, within, first, under):  # type: ignore[no-untyped-def]
     """Return the histogram (L,) of the level of the uppermost solid voxel in the columns around cell ``centre`` (2,).
 
-    Columns with another solid voxel in the ``under`` levels below it do not count, because they may be walls.
+    Columns with points in the ``under`` levels below it, except directly below, do not count: they may be walls.
     """
     n, levels = key.shape[0], odds.shape[2]
     found = np.zeros(levels, np.int64)
