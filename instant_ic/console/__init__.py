@@ -1,7 +1,7 @@
 """Operator's console: a web page, its server and a Python client.
 
-:class:`ConsoleServer` takes a :class:`ConsoleBackend` and plain values. :class:`~instant_ic.console.feed.PageFeed`
-feeds it with messages. :mod:`nodes.console` connects both to the topics.
+:class:`ConsoleServer` knows no messages, only plain values and a :class:`ConsoleBackend`.
+:class:`~instant_ic.console.feed.PageFeed` converts messages for it. :mod:`nodes.console` connects both to the topics.
 """
 
 from instant_ic.console.backend import ConsoleBackend

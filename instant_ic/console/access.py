@@ -21,8 +21,8 @@ from instant_ic.util.web_access import SIGN_IN, AccessError, AddressBuckets, is_
 
 COOKIE = "instant_ic_session"
 MIN_TOKEN = 16
-MAX_WAIT_S = 4.0  # before a wrong token is answered, once its address has sent too many of them
-_MOST_SESSIONS = 256  # of one role
+MAX_WAIT_S = 4.0  # delay of the answer to a wrong token if its address has sent too many wrong tokens
+_MOST_SESSIONS = 256  # per role
 
 
 class Role(Enum):
@@ -38,14 +38,14 @@ class AccessConfig:
 
     Attributes:
         sign_in: ``auto`` (required unless ``simulated``), ``always`` or ``never``.
-        simulated: true if the page drives simulated robots only. Then ``auto`` needs no sign-in on this machine, unless
-            there is a token file. The simulator's launch files set it.
-        token_file: file with the token to drive, readable by its owner only. If empty, each start makes a token and
-            shows it on the terminal and in a file readable by its owner only, never in the log.
-        watch_token_file: file with the token to watch and stop the robot only; empty: there is no such token.
-        session_hours: lifetime of a sign-in.
-        tries_per_minute: wrong tokens of one address that are answered at once. The answer to each further one comes
-            after ``MAX_WAIT_S``. A right token never waits.
+        simulated: true if the page drives only simulated robots. With ``auto``, this machine then needs no sign-in,
+            unless there is a token file. The simulator's launch files set it.
+        token_file: file with the token to drive, readable only by its owner. If empty, each start makes a token and
+            shows it on the terminal and in a file readable only by its owner, never in the log.
+        watch_token_file: file with the token that only permits to watch and stop the robot; empty: no such token.
+        session_hours: lifetime of a sign-in in hours.
+        tries_per_minute: number of wrong tokens per address that are answered at once. Answers to further wrong tokens
+            are delayed by ``MAX_WAIT_S``. A correct token never waits.
         tls_certificate: PEM file of the certificate; empty for plain HTTP.
         tls_key: PEM file of its key.
     """
@@ -71,7 +71,7 @@ def read_token(file: str) -> str:
     """Read the token from a file.
 
     Raises:
-        AccessError: the file is missing, others may read it, or its token is too easy to guess.
+        AccessError: the file is missing, other users may read it, or its token is too easy to guess.
     """
     path = Path(file).expanduser()
     try:
@@ -96,7 +96,7 @@ def tls_context(config: AccessConfig) -> ssl.SSLContext | None:
         return None
     context = ssl.create_default_context(ssl.Purpose.CLIENT_AUTH)
     context.minimum_version = ssl.TLSVersion.TLSv1_2
-    context.options |= ssl.OP_NO_RENEGOTIATION  # a client could force handshakes with a few bytes
+    context.options |= ssl.OP_NO_RENEGOTIATION  # otherwise a client could force handshakes with a few bytes
     files = [str(Path(file).expanduser()) for file in (config.tls_certificate, config.tls_key)]
     try:
         context.load_cert_chain(*files)
@@ -106,7 +106,7 @@ def tls_context(config: AccessConfig) -> ssl.SSLContext | None:
 
 
 class Access:
-    """Tokens, sessions and wrong tries.
+    """Tokens, sessions and counts of wrong tokens.
 
     Args:
         config: parameters.
@@ -114,8 +114,8 @@ class Access:
 
     Attributes:
         required: true if a sign-in is required.
-        unguarded: true if the parameters let anyone drive a robot who reaches the server.
-        made_token: token to drive that this start has made; empty with a token file.
+        unguarded: true if the parameters let anyone who reaches the server drive a robot.
+        made_token: token to drive that was made at this start; empty with a token file.
 
     Raises:
         AccessError: a token file cannot be used.
@@ -140,7 +140,7 @@ class Access:
             watch = read_token(config.watch_token_file)
             if hmac.compare_digest(watch, drive):
                 raise AccessError(
-                    "token_file and watch_token_file hold the same token, so watchers could drive; use two tokens"
+                    "token_file and watch_token_file contain the same token, so watchers could drive; use two tokens"
                 )
             self._digests[Role.WATCH] = _digest(watch)
 
@@ -152,18 +152,18 @@ class Access:
         return roles[0] if roles else None
 
     def role_of(self, token: str, cookie: str, now_s: float) -> Role | None:
-        """Return the role of a request: programs send a token, pages the cookie of their sign-in."""
+        """Return the role of a request. Programs send a token, pages send the cookie of their sign-in."""
         return self.role_of_token(token) if token else self.role_of_session(cookie, now_s)
 
     def count_wrong_token(self, address: str, now_s: float) -> float:
-        """Count a wrong token against its address; return the seconds to wait before answering it.
+        """Count a wrong token of an address, and return the seconds to wait before answering it.
 
-        Only wrong tokens wait: an emergency stop must not queue behind a guesser who shares its address.
+        Only wrong tokens wait, because an emergency stop must not queue behind a guesser with the same address.
         """
         return 0.0 if self._tries.of(address).take(now_s) else MAX_WAIT_S
 
     def open_session(self, role: Role, now_s: float) -> str:
-        """Open a session and return the value of its cookie; of too many of one role, the oldest ends."""
+        """Open a session and return the value of its cookie. If a role has too many sessions, its oldest one ends."""
         value = secrets.token_urlsafe(32)
         same = [digest for digest, (other, _) in self._sessions.items() if other is role]
         if len(same) >= _MOST_SESSIONS:

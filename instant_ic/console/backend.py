@@ -10,42 +10,42 @@ from instant_ic.console.view import Look
 
 
 class ConsoleBackend:
-    """Handler of the operators' actions; by default they have no effect.
+    """Handler of the operators' actions; by default the actions have no effect.
 
     Every method is called on the server's thread and must return at once.
     """
 
     def on_drive(self, linear: float, angular: float) -> None:
-        """Publish a command, m/s and rad/s: at 20 Hz while driving, zeros while the driver is present and idle."""
+        """Publish a command in m/s and rad/s; called at 20 Hz while driving, and with zeros for an idle driver."""
 
     def on_operator(self, there: bool) -> None:
-        """Note that a driver is present, or lost: his page is silent, hidden or closed, or he gave the lease back."""
+        """Record whether a driver is present. A silent, hidden or closed page, or a returned lease, means absent."""
 
     def on_released(self, client: str) -> None:
-        """Give the robot's lease back in the name of a client that drove (``DriveService.client``)."""
+        """Give the robot's lease back for a client that drove (``DriveService.client``)."""
 
     def on_estop(self, stop: bool) -> None:
         """Publish an emergency stop set by any client (True) or released by the driver (False)."""
 
     def on_look(self, look: Look) -> None:
-        """Take the new look direction and field of view of the driver."""
+        """Use a new look direction and field of view of the driver."""
 
     def on_recorder(self, command: str, on: bool) -> None:
         """Start or stop a recording (``record``, ``on``), save the last minute (``snapshot``) or set a ``bookmark``."""
 
     def on_watched(self, watched: bool) -> None:
-        """Note that the first page has come (True) or the last one has gone (False)."""
+        """Record that the first page has connected (True) or the last page has gone (False)."""
 
     def on_drawn(self) -> None:
-        """Note that ``ConsoleServer.drawn_ms`` has changed."""
+        """Handle a change of ``ConsoleServer.drawn_ms``."""
 
 
 class PageServer:
-    """Receiver of everything that is sent to pages. This one has a page that shows nothing."""
+    """Receiver of everything that is sent to pages. This base class shows nothing."""
 
     @property
     def plain_http(self) -> bool:
-        """True if token, cookie and commands go over the network unencrypted."""
+        """True if token, cookie and commands are sent over the network without encryption."""
         return False
 
     def now_ms(self) -> float:
@@ -53,7 +53,7 @@ class PageServer:
         return 0.0
 
     def needs_views(self) -> bool:
-        """Return whether a page does not render the virtual space by itself."""
+        """Return whether there is a page that does not render the virtual space by itself."""
         return True
 
     def drawn_ms(self) -> float | None:
@@ -61,16 +61,16 @@ class PageServer:
         return None
 
     def show(self, *kinds: FrameKind) -> None:
-        """Set which of PANORAMA and VIEW the page shows or soon will; the other is sent at a low rate."""
+        """Set which of PANORAMA and VIEW the page shows or soon will show. The other is sent at a low rate."""
 
     def follow_robot(self, holder: str | None, estop: bool = False) -> None:
-        """Take over who has the robot's lease (empty: nobody) and its emergency stop; None: no robot reports."""
+        """Follow the robot's lease holder (empty: nobody; None: no robot reports) and its emergency stop."""
 
     def publish(self, kind: str, message: dict[str, Any]) -> None:
-        """Send a text message of type ``kind`` to every page; it replaces a pending one of this kind."""
+        """Send a text message of type ``kind`` to every page. It replaces a pending message of the same kind."""
 
     def send_frame(self, kind: FrameKind, header: dict[str, Any], payload: bytes) -> None:
-        """Send an image or map (JPEG or PNG) to every page; it replaces a pending one of this kind."""
+        """Send an image or map (JPEG or PNG) to every page. It replaces a pending frame of the same kind."""
 
     def send_layers(self, layers: PageLayers) -> None:
-        """Send a version of the virtual space, which is checked already, to every page; it replaces a pending one."""
+        """Send a checked version of the virtual space to every page. It replaces a pending version."""

@@ -26,9 +26,9 @@ class ConsoleClient:
             console.drive(0.3, 0.0)
             await console.wait_for(lambda c: c.mode == "virtual", timeout_s=60)
 
-    ``state``, ``plan``, ``health``, ``session`` and ``hello`` hold the newest message of that type;
-    ``frames[FrameKind.PANORAMA]`` holds the newest panorama. ``socket`` is the WebSocket, ``beats`` the task that sends
-    pings and repeats the command.
+    ``state``, ``plan``, ``health``, ``session`` and ``hello`` are the newest messages of these types, and
+    ``frames[FrameKind.PANORAMA]`` is the newest panorama. ``socket`` is the WebSocket, and ``beats`` the task that
+    sends pings and repeats the command.
     """
 
     def __init__(
@@ -43,9 +43,9 @@ class ConsoleClient:
 
         Args:
             url: the page's address; its ``?token=`` is used if ``token`` is empty.
-            acknowledge: whether to acknowledge frames; the server sends the next one only then.
+            acknowledge: acknowledge frames; without acknowledgement the server sends no further frames.
             token: sign-in token, if the server requires one.
-            ca_file: for ``https``: PEM file of the authority or of the server's own certificate.
+            ca_file: for ``https``, PEM file of the authority's or the server's certificate.
         """
         parts = urlsplit(url)
         self.url = parts._replace(query="").geturl()
@@ -59,7 +59,7 @@ class ConsoleClient:
         self.refused: list[str] = []
         self.errors: list[str] = []
         self.round_trip_s: float | None = None
-        self._offset_ms = math.nan  # server's clock minus this one; known from the first pong on
+        self._offset_ms = math.nan  # server's clock minus this clock; known after the first pong
         self._sequence = 0
         self._command = (0.0, 0.0)
         self._http: aiohttp.ClientSession | None = None
@@ -79,7 +79,7 @@ class ConsoleClient:
         """Connect, and wait until the clock offset to the server is known.
 
         Raises:
-            aiohttp.WSServerHandshakeError: the server refuses; 401 if the token is missing or wrong.
+            aiohttp.WSServerHandshakeError: the server refuses the connection; 401 if the token is missing or wrong.
             TimeoutError: the server does not answer.
         """
         self._http = aiohttp.ClientSession()
@@ -129,16 +129,16 @@ class ConsoleClient:
         return self.socket is None or self.socket.closed
 
     async def acquire(self, *, take: bool = False, timeout_s: float = 5.0) -> None:
-        """Become the driver; raise TimeoutError if another client keeps the lease."""
+        """Become the driver. Raise TimeoutError if another client keeps the lease."""
         await self.send({"type": "lease", "take": take})
         await self.wait_for(lambda c: c.session.get("driver") == "you", timeout_s)
 
     def drive(self, linear: float, angular: float) -> None:
-        """Send this command (m/s, rad/s) at 20 Hz until :meth:`stop`."""
+        """Send a command (m/s, rad/s) at 20 Hz until :meth:`stop`."""
         self._command = (linear, angular)
 
     async def stop(self) -> None:
-        """Send one zero command at once, and none after it."""
+        """Send one zero command at once, and no command after it."""
         self._command = (0.0, 0.0)
         await self.send_drive(0.0, 0.0)
 
@@ -151,7 +151,7 @@ class ConsoleClient:
         await self.send({"type": "estop_release"})
 
     async def look(self, yaw: float, pitch: float = 0.0, hfov: float = 1.57, vfov: float = 1.02) -> None:
-        """Set the look direction (rad; left and up positive; relative to the robot's heading)."""
+        """Set the look direction in rad relative to the robot's heading; left and up are positive."""
         await self.send({"type": "look", "yaw": yaw, "pitch": pitch, "hfov": hfov, "vfov": vfov})
 
     async def send_drive(self, linear: float, angular: float, *, age_s: float = 0.0) -> None:
@@ -176,7 +176,7 @@ class ConsoleClient:
         """Wait until ``predicate(self)`` is true; it is checked after each message.
 
         Raises:
-            TimeoutError: with the newest state in its text.
+            TimeoutError: the condition was not met in time; the message contains the newest state.
             ConnectionError: the server closed the connection.
         """
         try:

@@ -17,16 +17,16 @@ class ConsoleServerConfig(Checked):
     """Address, limits and access of the server.
 
     Attributes:
-        host: listen address; any but loopback (e.g. 0.0.0.0) opens the page to the network.
-        port: 0 = any free port; the log states it.
+        host: listen address; an address other than loopback, such as 0.0.0.0, opens the page to the network.
+        port: port of the page; 0: any free port, which the log states.
         allowed_hosts: host names by which browsers may reach the page, besides localhost and IP addresses.
         max_clients: largest number of pages; two places are reserved for pages that may drive.
-        max_connections: largest number of connections; at the limit the address with the most idle ones loses its
-            oldest.
-        max_connections_per_address: the same for one address (IPv6: one /64).
-        max_messages_per_s: limit for the driver's page, with bursts of twice this number; 0.4 of it for others; above,
-            the WebSocket is closed.
-        background_picture_hz: rate of images that are not shown (the camera while in the virtual space).
+        max_connections: largest number of connections; at the limit, the address with the most idle connections loses
+            its oldest.
+        max_connections_per_address: largest number of connections of one address (IPv6: one /64).
+        max_messages_per_s: largest rate of messages from the driver's page, with bursts of twice this number; 0.4 of it
+            for other pages. The WebSocket of a page above it is closed.
+        background_picture_hz: rate of images that are not shown, such as the camera's while in the virtual space.
         access: sign-in and TLS.
         drive: speed limits and time-outs.
     """
@@ -49,11 +49,10 @@ class ConsoleConfig(Checked):
 
     Attributes:
         map_rate_hz: highest rate at which a changed map or costmap is sent to the page.
-        dissolve_ms: duration of the dissolve between camera and rendered view; 0 = cut.
-        ease_ms: time in which the remaining offset between the two robots' poses is eased out of the image; 0 = at
-            once.
-        colour_release_s: the new image at a switch takes the colours of the old one and returns to its own in this
-            time; 0 = no colour matching.
+        dissolve_ms: duration of the dissolve between camera image and rendered view; 0: cut.
+        ease_ms: time in which the remaining offset between the two robots' poses is eased out of the image; 0: at once.
+        colour_release_s: time in which the new image at a switch returns from the old image's colours to its own; 0: no
+            colour matching.
         recorder: node behind the page's record, snapshot and bookmark buttons.
     """
 
@@ -69,7 +68,7 @@ class ConsoleConfig(Checked):
     recorder: str = "operator_recorder"
 
     def page(self) -> dict[str, Any]:
-        """Return the values that the page gets in ``hello``."""
+        """Return the values that the page receives in ``hello``."""
         return {
             "dissolve_ms": self.dissolve_ms,
             "ease_ms": self.ease_ms,

@@ -1,6 +1,6 @@
-"""Limits on what clients of the operator's page can cost: connections in number, rate and duration, and log messages.
+"""Limits on the cost of the page's clients: number, rate and duration of connections, and log messages.
 
-The module depends on the HTTP server, not on the page. Times are seconds of the monotonic clock.
+The module depends on the HTTP server, but not on the page. Times are seconds of the monotonic clock.
 """
 
 from __future__ import annotations
@@ -18,18 +18,18 @@ from aiohttp import web
 
 from instant_ic.util.web_access import AddressBuckets, TokenBucket, network_of
 
-HEADERS_S = 5.0  # time for a TLS handshake, for a request's headers, and for its body
-STALL_S = 30.0  # a client that takes no data for this time is disconnected
+HEADERS_S = 5.0  # time limit for each of a TLS handshake, a request's headers, and its body
+STALL_S = 30.0  # time without accepting any data after which a client is disconnected
 CLOSE_S = 1.0  # time for a closing handshake
 RETRY_S = 0.2  # pause after a failed accept
-BYTES_PER_S = 48 * 1024  # received on one connection; a page that drives by touch sends about a third
+BYTES_PER_S = 48 * 1024  # received on one connection; a page that drives by touch sends about a third of it
 BURST_BYTES = 48 * 1024
-CONNECTIONS_PER_S = 20.0  # of one address, without a sign-in; a page opens about six
+CONNECTIONS_PER_S = 20.0  # per address, without a sign-in; a page opens about six connections
 BURST_CONNECTIONS = 64.0
-HANDSHAKES_PER_S = 400.0  # TLS, of one address; each costs about 1 ms of the thread that passes the driver's commands
+HANDSHAKES_PER_S = 400.0  # TLS, per address; each costs about 1 ms of the thread that passes the driver's commands
 BURST_HANDSHAKES = 128.0
 MOST_NEWCOMERS = 256  # connections whose first request has not arrived
-MOST_HEADERS = 32 * 1024  # bytes of a request line with its headers; browsers send cookies of all ports of a host
+MOST_HEADERS = 32 * 1024  # bytes of request line and headers, in which browsers send the cookies of all ports of a host
 _TOO_MANY = b"HTTP/1.1 429 Too Many Requests\r\nRetry-After: 1\r\nContent-Length: 0\r\nConnection: close\r\n\r\n"
 NOISY = ("instant_ic.console", "asyncio", "aiohttp.server", "aiohttp.web", "aiohttp.websocket", "aiohttp.internal")
 LOG_PERIOD_S = 1.0
@@ -37,15 +37,15 @@ logger = logging.getLogger("instant_ic.console")
 
 
 class LimitedConnection(asyncio.Protocol):
-    """One client's connection. It passes data to aiohttp's protocol, and is cut if it floods or takes no data.
+    """One client's connection, which passes data to aiohttp's protocol. A client that floods or stalls is cut.
 
     The connection is a newcomer until its first request's headers are complete and the listener admits it. A newcomer
-    costs no more than these headers.
+    costs only the memory of these headers.
 
     Attributes:
         network: see :func:`network_of`.
         http: aiohttp's protocol; None for a newcomer.
-        kept: whether it is a WebSocket, which no newer connection displaces.
+        kept: True for a WebSocket, which no newer connection displaces.
     """
 
     def __init__(self, listener: Listener, network: str) -> None:
@@ -62,11 +62,11 @@ class LimitedConnection(asyncio.Protocol):
         self._deadline: asyncio.TimerHandle | None = None
 
     def keep(self, on_flood: Callable[[], None]) -> None:
-        """Mark the connection as a WebSocket; ``on_flood`` is called once if its client sends too much."""
+        """Mark the connection as a WebSocket. ``on_flood`` is called once if the client sends too much."""
         self.kept, self._on_flood = True, on_flood
 
     def mute(self) -> None:
-        """Stop reading. Pending data still goes to the client, and what the client sends costs nothing."""
+        """Stop reading, so that data from the client cost nothing. Pending data are still sent to the client."""
         self._muted = True
         if self.transport is not None and not self.transport.is_closing():
             self.transport.pause_reading()
@@ -91,7 +91,7 @@ class LimitedConnection(asyncio.Protocol):
                 self._listener.take_headers(self, self._received)
             elif len(self._received) > MOST_HEADERS:
                 self.abort()
-        # Bytes, not messages: an endless frame is never a message, yet costs as much.
+        # Count bytes, not messages, because an endless frame costs as much but never becomes a message.
         elif not self._muted and self._bucket.take(time.monotonic(), len(data)):
             self.http.data_received(data)
         elif not self._muted:
@@ -99,7 +99,7 @@ class LimitedConnection(asyncio.Protocol):
             self._on_flood()
 
     def admit(self, http: web.RequestHandler) -> None:
-        """Let aiohttp answer the request that has arrived, and the following ones."""
+        """Let aiohttp answer the received request and the following ones."""
         assert self.transport is not None
         self.http = http
         http.connection_made(self.transport)
@@ -133,21 +133,21 @@ class LimitedConnection(asyncio.Protocol):
 
 
 class Listener:
-    """Accepts connections within limits.
+    """Acceptance of connections within limits.
 
-    1. Each starts as a newcomer. Of too many, the oldest one of the address with the most is cut.
-    2. With its headers complete it is admitted if ``known`` says so, or within the rate of its address. So nobody
-       who is signed in waits for others of his address, which may be a whole building's.
-    3. At the limit of an address, its oldest connection that is not a WebSocket makes room. At the total limit, the
-       oldest one of the address with the most such connections does. So a client with idle connections displaces
-       itself.
+    1. Each connection starts as a newcomer. If there are too many newcomers, the address with the most of them loses
+       its oldest.
+    2. A newcomer with complete headers is admitted if ``known`` returns true for them, or if its address is below its
+       rate. A signed-in user thus never waits for others with his address, which a whole building may share.
+    3. At the limit of an address, its oldest connection that is not a WebSocket is cut. At the total limit, the address
+       with the most such connections loses its oldest. A client with idle connections thus displaces its own.
 
     Args:
         server: makes aiohttp's protocol for each connection.
-        most: largest number of simultaneous connections, newcomers not counted.
-        most_per_address: the same for one address.
-        tls: context for https; None: http.
-        known: whether a request with these headers is admitted above the rate.
+        most: largest number of simultaneous connections, without newcomers.
+        most_per_address: largest number of simultaneous connections of one address, without newcomers.
+        tls: context for https; None for http.
+        known: returns whether a request with these headers is admitted above the rate.
 
     Attributes:
         refused: number of connections that were not admitted.
@@ -210,17 +210,17 @@ class Listener:
         network = newcomer.network
         own = [connection for connection in self.admitted if connection.network == network]
         if not (self._known(headers) or self._rates.of(network).take(time.monotonic())):
-            reason = f"more than {CONNECTIONS_PER_S:g} new ones a second without a sign-in"
+            reason = f"more than {CONNECTIONS_PER_S:g} new connections per second without a sign-in"
         elif len(own) >= self._most_per_address and not self._displace(own):
-            reason = f"it has {len(own)} WebSockets"
+            reason = f"the address has {len(own)} WebSockets"
         elif len(self.admitted) >= self._most and not self._displace(self.admitted):
-            reason = f"all {self._most} are WebSockets"
+            reason = f"all {self._most} connections are WebSockets"
         else:
             newcomer.admit(self._server())
             return
         assert newcomer.transport is not None
         newcomer.transport.write(_TOO_MANY)
-        newcomer.abort()  # a slow goodbye would cost a place
+        newcomer.abort()  # a closing handshake would occupy a place
         self._refuse(network, reason)
 
     def forget(self, connection: LimitedConnection) -> None:
@@ -235,17 +235,17 @@ class Listener:
             except ConnectionAbortedError:  # the client left before it was accepted
                 continue
             except OSError as error:  # out of file descriptors or memory
-                logger.error("cannot accept a connection: %s; an idle one is closed to make room", error.strerror)
+                logger.error("cannot accept a connection: %s; an idle connection is closed", error.strerror)
                 _ = self._displace(self._newcomers) or self._displace(self.admitted)
                 await asyncio.sleep(RETRY_S)
                 continue
             self._receive(accepted, network_of(peer[0]))
-            await asyncio.sleep(0)  # existing connections come first
+            await asyncio.sleep(0)  # serve existing connections first
 
     def _receive(self, accepted: socket.socket, network: str) -> None:
         if self._tls is not None and not self._handshakes.of(network).take(time.monotonic()):
             accepted.close()
-            self._refuse(network, f"more than {HANDSHAKES_PER_S:g} new ones a second")
+            self._refuse(network, f"more than {HANDSHAKES_PER_S:g} new connections per second")
             return
         if len(self._newcomers) >= MOST_NEWCOMERS:
             self._displace(self._newcomers)
@@ -258,7 +258,7 @@ class Listener:
         logger.warning("refused a connection from %s: %s", network, reason)
 
     def _displace(self, connections: Iterable[LimitedConnection]) -> bool:
-        """Cut the oldest non-WebSocket of the address that has the most of them; return False if there is none."""
+        """Cut the oldest non-WebSocket of the address with the most non-WebSockets; return False if there is none."""
         idle = [connection for connection in connections if not connection.kept]
         if not idle:
             return False
@@ -287,10 +287,10 @@ def _report_end(task: asyncio.Task[None]) -> None:
 
 
 class LogRate(logging.Filter):
-    """Passes one record of each place in the code every ``LOG_PERIOD_S``; the next one states how many were dropped.
+    """Filter that passes one record per place in the code every ``LOG_PERIOD_S``, with the number of dropped records.
 
     Args:
-        clock: monotonic time in seconds; tests pass their own.
+        clock: returns the monotonic time in seconds; replaced in tests.
     """
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
@@ -315,6 +315,6 @@ _FILTER = LogRate()
 
 
 def limit_logs() -> None:
-    """Limit the loggers of the console, asyncio and aiohttp's server. Further calls change nothing."""
+    """Limit the loggers of the console, asyncio and aiohttp's server. Idempotent."""
     for name in NOISY:
         logging.getLogger(name).addFilter(_FILTER)

@@ -25,14 +25,14 @@ class Display:
     Args:
         tf: transform tree.
         clock: time of the stamps, and a steady time.
-        mount: mount of the camera while the tree lacks it.
+        mount: camera mount used until the tree contains it.
 
     Attributes:
         control: newest ControlState.
         vbot: newest odometry of the v-bot.
         mode: name of the control mode; ``none`` without an arbiter.
         shown: ``real`` (camera image), ``virtual`` (rendered view) or ``none``.
-        image_stamp_ns: stamp of the newest camera image; 0 without one.
+        image_stamp_ns: stamp of the newest camera image; 0 if there is none.
     """
 
     def __init__(self, tf: TransformBuffer, clock: Clock, control: Latest, vbot: Latest, mount: Mount) -> None:
@@ -42,20 +42,20 @@ class Display:
         self._image_ns: int | None = None  # arrival of the newest camera image, steady clock
         self.image_stamp_ns = 0
         self._view = (0, 0, 0.0)  # driver's newest view: request id, arrival (steady ns), delay (s)
-        self._view_pose = pose_message(np.eye(4))  # map_from_camera of that
-        self._drawn_ms: float | None = None  # newest state that the driver's page has rendered by itself
-        self._drawn_ns = self._drawn_id = 0  # its time, steady clock; counts such states
-        self._lost_ns: int | None = None  # when the driver was last lost, steady clock
+        self._view_pose = pose_message(np.eye(4))  # map_from_camera of that view
+        self._drawn_ms: float | None = None  # time of the newest state that the driver's page has rendered by itself
+        self._drawn_ns = self._drawn_id = 0  # the same time by the steady clock, and the number of such states
+        self._lost_ns: int | None = None  # time of the driver's last loss, steady clock
 
     @property
     def with_vbot(self) -> bool:
-        """True if the v-bot's view is shown or soon will be."""
+        """True if the v-bot's view is shown or soon will be shown."""
         return self.mode in ("entering", "virtual", "returning")
 
     @property
     def foreground(self) -> tuple[FrameKind, ...]:
-        """Kinds of images that the page shows or soon will."""
-        if self.mode in ("entering", "returning"):  # the switch may come at any moment
+        """Kinds of images that the page shows or soon will show."""
+        if self.mode in ("entering", "returning"):  # the switch may happen at any moment
             return FrameKind.VIEW, FrameKind.PANORAMA
         return (FrameKind.VIEW if self.shown == "virtual" else FrameKind.PANORAMA,)
 
@@ -72,19 +72,19 @@ class Display:
             self.shown = "virtual" if int(control.shown) == ControlState.SHOWN_VIRTUAL else "real"
 
     def take_image(self, stamp_ns: int) -> None:
-        """Note a camera image."""
+        """Record the arrival of a camera image."""
         self._image_ns, self.image_stamp_ns = self._clock.steady_ns(), stamp_ns
 
     def take_view(self, request_id: int, delay_s: float, camera: Pose) -> None:
-        """Note a view rendered for the driver at the pose ``camera``."""
+        """Record a view that was rendered for the driver at the pose ``camera``."""
         self._view, self._view_pose = (request_id, self._clock.steady_ns(), delay_s), camera
 
     def take_drawn(self, drawn_ms: float | None, server_ms: float) -> None:
-        """Note what the driver's page renders by itself.
+        """Record the newest state that the driver's page has rendered by itself.
 
         Args:
-            drawn_ms: time of the newest state that it has shown; None: it shows rendered views.
-            server_ms: present time of the same clock.
+            drawn_ms: time of that state by the server's clock; None if the page shows rendered views.
+            server_ms: present time of the server's clock.
         """
         if drawn_ms is not None and drawn_ms != self._drawn_ms:
             self._drawn_ns = self._clock.steady_ns() - round(max(server_ms - drawn_ms, 0.0) * 1e6 * current().factor)
@@ -92,12 +92,12 @@ class Display:
         self._drawn_ms = drawn_ms
 
     def lose_driver(self) -> None:
-        """Note the loss of the driver."""
+        """Record the loss of the driver."""
         self._lost_ns = self._clock.steady_ns()
 
     @property
     def image_age_s(self) -> float:
-        """Age of the newest camera image since its arrival; infinite without one."""
+        """Age of the newest camera image since its arrival; infinite if there is none."""
         return math.inf if self._image_ns is None else (self._clock.steady_ns() - self._image_ns) / 1e9
 
     def report(self) -> ShownPictures:
@@ -106,7 +106,7 @@ class Display:
         lost_ns = self._lost_ns
         view_id, came_ns, delay_s = self._view
         pose = self._view_pose
-        if self._drawn_ms is not None:  # the page renders the v-bot's present pose, as of this state
+        if self._drawn_ms is not None:  # the page renders the v-bot's pose in this state
             view_id, came_ns, delay_s = self._drawn_id, self._drawn_ns, 0.0
             if (vbot := self.vbot_pose()) is not None:
                 pose = pose_message(vbot @ self.camera_mount())
@@ -118,12 +118,12 @@ class Display:
             view_pose=pose,
             view_age_s=math.inf if view_id == 0 else (now_ns - came_ns) / 1e9,
             view_delay_s=delay_s,
-            # Steady clock: if the system clock is set back, new commands must not look older than the loss.
+            # By the steady clock, so that new commands never look older than the loss if the system clock is set back.
             operator_lost=to_time(0 if lost_ns is None else stamp_ns - (now_ns - lost_ns)),
         )
 
     def lookup(self, target: str, source: str, stamp_ns: int | None = None) -> Matrix | None:
-        """Return ``target_from_source`` at ``stamp_ns``, else the newest one; None if the tree has a gap."""
+        """Return ``target_from_source`` at ``stamp_ns``, or the newest transform; None if the tree has a gap."""
         for when in (stamp_ns, None):
             try:
                 return self._tf.lookup(target, source, when)
@@ -138,14 +138,14 @@ class Display:
         return matrix_from_pose(control.robot_pose) if pose is None and control is not None else pose
 
     def vbot_pose(self) -> Matrix | None:
-        """Return map_from_base of the v-bot; the arbiter's estimate until the v-bot publishes its own."""
+        """Return map_from_base of the v-bot; the arbiter's estimate until the v-bot publishes its pose."""
         if self.vbot.message is not None:
             return matrix_from_pose(self.vbot.message)
         control = self.control.message
         return None if control is None else matrix_from_pose(control.vbot_pose)
 
     def camera_mount(self) -> Matrix:
-        """Return base_from_camera with the identity as rotation: look directions are relative to the heading."""
+        """Return base_from_camera without rotation, because look directions are relative to the heading."""
         mount = np.eye(4)
         base_from_camera = self.lookup("base_link", "camera")
         mount[:3, 3] = self._mount.xyz if base_from_camera is None else base_from_camera[:3, 3]

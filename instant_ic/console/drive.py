@@ -1,7 +1,7 @@
-"""Driving through the console: one driver's commands, and everybody's emergency stop.
+"""Driving through the console: commands of one driver, and an emergency stop for everyone.
 
-:class:`DriveGate` decides which command is valid. It knows no socket, and its caller passes the time. On the server's
-loop :class:`DriveService` publishes what the gate lets pass.
+:class:`DriveGate` decides which command is valid. It knows no sockets, and its caller passes the time.
+:class:`DriveService` publishes the commands that the gate passes, on the server's loop.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ from instant_ic.control.robot_lease import Verdict, sender_name
 from instant_ic.util.pace import current, suspended_ns
 from instant_ic.util.step_gap import StepGap
 
-RATE_COMMANDS = 200  # newest commands kept to measure the rate
-CONFIRM_S = 1.0  # time in which the robot confirms a press of the emergency stop; until then the press counts
+RATE_COMMANDS = 200  # number of newest commands that are kept to measure the rate
+CONFIRM_S = 1.0  # time in which the robot must confirm a press of the emergency stop; until then the press counts
 LOOK_S = 0.1
 """Longest time between two steps of the server while there is a driver."""
 logger = logging.getLogger("instant_ic.console")
@@ -39,15 +39,15 @@ class DriveConfig:
         max_angular_rps: rad/s at full speed limit; commands are clamped to it.
         rate_hz: rate of /operator/cmd_vel while driving.
         watchdog_s: time without a command from the page, while driving, after which zero is published.
-        max_command_age_s: commands older than this on arrival are dropped.
-        stop_repeat_s: time after a stop in which zeros are published at rate_hz; afterwards at keep_alive_hz.
-        keep_alive_hz: zeros of an idle driver; they show the arbiter that the operator is present (arbiter:
+        max_command_age_s: largest age of a command on arrival; older commands are dropped.
+        stop_repeat_s: time after a stop during which zeros are published at rate_hz; afterwards at keep_alive_hz.
+        keep_alive_hz: rate of an idle driver's zeros, which show the arbiter that the operator is present (arbiter:
             timeouts.command).
-        beat_timeout_s: silence of the driver's page (pings at 20 Hz) after which the driver is reported lost to the
-            arbiter.
-        lease_timeout_s: silence of the driver's page after which it loses the lease.
-        stop_after_s: standstill of the console after which the driver must let go of the controls; at most the
-            arbiter's timeouts.stop_after_s.
+        beat_timeout_s: time without a message from the driver's page (it pings at 20 Hz) after which the driver is
+            reported lost to the arbiter.
+        lease_timeout_s: time without a message from the driver's page after which it loses the lease.
+        stop_after_s: time for which the console may stand still before the driver must let go of the controls; at most
+            the arbiter's timeouts.stop_after_s.
     """
 
     max_linear_mps: Annotated[float, Plausible(0.02, 3)] = 0.4
@@ -68,11 +68,11 @@ class DriveConfig:
 
 
 class DriveGate:
-    """Lease of one driver, and the newest command that is still valid; zero whenever in doubt.
+    """Lease of one driver, and the newest command that is still valid; zero if in doubt.
 
-    Zeros mean that the operator is present and commands nothing; silence means that nobody is present. An idle driver's
-    zeros are therefore published only while his page is heard. After its loss one zero is published, then nothing.
-    :meth:`driver_alive` reports the loss itself.
+    Zeros mean that the operator is present and commands nothing. Silence means that nobody is present. Zeros of an idle
+    driver are therefore published only while his page sends messages. After the page's loss one zero is published, then
+    nothing. :meth:`driver_alive` reports the loss.
     """
 
     def __init__(self, config: DriveConfig) -> None:
@@ -80,8 +80,8 @@ class DriveGate:
         self._gate = CommandGate(GateLimits(max_age_s=config.max_command_age_s, max_ahead_s=config.max_command_age_s))
         self.driver: int | None = None
         self.estop = False
-        self._robot_known = False  # the robot reports its emergency stop
-        self._pressed = -math.inf  # emergency stop pressed here and not confirmed by the robot
+        self._robot_known = False  # True if the robot reports its emergency stop
+        self._pressed = -math.inf  # time of a press of the emergency stop that the robot has not confirmed
         self.watchdog_trips = 0
         self.last_age_s: float | None = None
         self._accepted: deque[float] = deque(maxlen=RATE_COMMANDS)
@@ -94,14 +94,15 @@ class DriveGate:
         self._emitted = -math.inf
         self._emitted_command: tuple[float, float] | None = None
         self._gap = StepGap()
-        self._held = False  # an interrupted drive: the controls must be released first
-        self._let_go_since = -math.inf  # the driver's page is present and commands no motion
+        self._held = False  # True after an interruption, until the driver has let go of the controls
+        self._let_go_since = -math.inf  # time since which the driver's page is present and commands no motion
 
     def look(self, now: float, suspended_ns: int = 0) -> None:
-        """Note a step of the server, at least every ``LOOK_S`` while there is a driver; before any message is handled.
+        """Record a step of the server: before any message, and at least every ``LOOK_S`` while there is a driver.
 
-        After a gap the command is zero and the driver lost. After a long one, or if the machine was suspended, the
-        driver must first let go of the controls for ``watchdog_s``: the page has sent the held key all the time.
+        After a gap between steps, the command is zero and the driver counts as lost. After a long gap, or if the
+        machine was suspended, the driver must let go of the controls for ``watchdog_s``, because the page may have sent
+        a held key all the time.
         """
         gap_s = self._gap.step(round(now * 1e9), suspended_ns)
         if self.driver is None:
@@ -144,9 +145,10 @@ class DriveGate:
         self._sequence.pop(client, None)
 
     def touch(self, client: int, now: float, *, away: bool = False) -> bool:
-        """Note a message of ``client``; return True if it changes whether the driver is present.
+        """Record a message of ``client``; return True if it changes whether the driver is present.
 
-        ``away``: the page is hidden or its operator types. It keeps the lease, but the operator counts as absent.
+        ``away`` means that the page is hidden or its operator is typing. The page keeps the lease, but its operator
+        counts as absent.
         """
         if self.driver != client:
             return False
@@ -154,7 +156,7 @@ class DriveGate:
         if not was_there:
             self._let_go_since = now
         self._driver_seen = now
-        self._driver_beat = -math.inf if away else now  # absent at once, without the time-out
+        self._driver_beat = -math.inf if away else now  # an away driver is absent at once, without the time-out
         if away:
             self.stop(now)
         return was_there == away
@@ -218,7 +220,7 @@ class DriveGate:
     def release_estop(self, client: int) -> bool:
         """Return whether ``client`` is the driver, who alone may release the emergency stop.
 
-        Where a robot reports its state, the stop ends when it says so (:meth:`follow_estop`), else at once.
+        If a robot reports its state, the stop ends when the robot reports it (:meth:`follow_estop`), otherwise at once.
         """
         if client != self.driver:
             return False
@@ -226,7 +228,7 @@ class DriveGate:
         return True
 
     def follow_estop(self, pressed: bool | None, now: float) -> bool:
-        """Take over the robot's emergency stop; None: it reports none. Return whether the state has changed."""
+        """Follow the robot's emergency stop (None: no robot reports it). Return whether the state has changed."""
         before, self._robot_known = self.estop, pressed is not None
         if pressed:
             self._pressed = -math.inf
@@ -241,15 +243,15 @@ class DriveGate:
         if self.moving and now - self._received >= self.config.watchdog_s:
             self.watchdog_trips += 1
             self.stop(now)
-            self._driver_beat = -math.inf  # a lost driver, not a commanded stop: report it, and the base brakes hard
+            self._driver_beat = -math.inf  # report a lost driver, so that the base brakes hard
         if self.driver is not None and now - self._driver_seen >= self.config.lease_timeout_s:
             self.leave(self.driver, now)
-        # The one zero after a stop is published even if the driver has gone.
+        # One zero after a stop is published even if the driver has gone.
         if not self.moving and not self.driver_alive(now) and self._emitted_command in (None, (0.0, 0.0)):
             self._emitted_command = None
             return None
         changed = self._command != self._emitted_command
-        # 1 ms of slack, so that a timer that fires slightly early does not skip a period.
+        # With 1 ms of tolerance, a timer that fires slightly early does not skip a period.
         if not changed and now - self._emitted < self._period_s(now) - 0.001:
             return None
         self._emitted = now
@@ -270,16 +272,16 @@ class DriveGate:
         return max(now, min(deadlines)) if deadlines else None
 
     def _period_s(self, now: float) -> float:
-        """Time between two published commands."""
+        """Return the time between two published commands."""
         repeating = now - self._stopped_at <= self.config.stop_repeat_s
         return 1.0 / (self.config.rate_hz if self.moving or repeating else self.config.keep_alive_hz)
 
 
 class DriveService:
-    """Drive gate on the server's loop: publishes what is due, and follows the robot's lease and emergency stop.
+    """The drive gate on the server's loop. It publishes due commands and follows the robot's lease and emergency stop.
 
     Clients are identified by their number. The gate's time is the steady clock of the pace. After a call that changes
-    the gate, :meth:`settle` must follow.
+    the gate, :meth:`settle` must be called.
 
     Args:
         backend: publishes commands and emergency stops.
@@ -287,17 +289,17 @@ class DriveService:
 
     Attributes:
         gate: decides which command is valid.
-        on_change: called when driver, robot's driver or emergency stop has changed.
+        on_change: called when the driver, the robot's driver or the emergency stop has changed.
     """
 
     def __init__(self, backend: ConsoleBackend, config: DriveConfig) -> None:
         self.gate = DriveGate(config)
         self.on_change: Callable[[], None] = lambda: None
         self._backend = backend
-        self._instance = secrets.token_hex(4)  # other consoles, and the next start, have clients of the same numbers
-        self._present = False  # the backend knows that a driver is present
+        self._instance = secrets.token_hex(4)  # other consoles and the next start use the same client numbers
+        self._present = False  # True if the backend was notified that a driver is present
         self._commanding: int | None = None  # client in whose name the backend commands
-        self._holder: str | None = None  # who has the robot's lease; empty: nobody; None: unknown
+        self._holder: str | None = None  # holder of the robot's lease; empty: nobody; None: unknown
         self._trips = 0
         self._reported = self._state
         self._wake = asyncio.Event()
@@ -308,25 +310,25 @@ class DriveService:
         return self._name_of(self._commanding or 0)
 
     async def run(self) -> None:
-        """Publish what is due, until cancelled."""
+        """Publish due commands until cancelled."""
         pace = current()
         while True:
             now = pace.steady_s()
             deadline = self.gate.next_deadline(now)
-            if self.gate.driver is not None and deadline is not None:  # the gate looks at the time between its steps
+            if self.gate.driver is not None and deadline is not None:  # the gate checks the time between its steps
                 deadline = min(deadline, now + LOOK_S)
             self._wake.clear()
             with contextlib.suppress(TimeoutError):
                 delay = None if deadline is None else max(pace.wait_s(deadline - pace.steady_s()), 0.001)
                 await asyncio.wait_for(self._wake.wait(), delay)
-                continue  # woken: the deadline may have changed
+                continue  # woken, because the deadline may have changed
             try:
                 self.settle()
             except Exception:  # the watchdog must outlive an error of the backend
                 logger.exception("a drive command could not be published")
 
     def settle(self) -> None:
-        """Publish the command that is due, and report what has changed."""
+        """Publish the due command, and report changes."""
         now = current().steady_s()
         self.look(now)
         command = self.gate.take_due(now)
@@ -342,7 +344,7 @@ class DriveService:
             self._backend.on_operator(present)
         if self.gate.watchdog_trips != self._trips:
             self._trips = self.gate.watchdog_trips
-            logger.warning("no drive command for %.2f s: published zero", self.gate.config.watchdog_s)
+            logger.warning("no drive command for %.2f s; published zero", self.gate.config.watchdog_s)
         if self._state != self._reported:
             self._reported = self._state
             self.on_change()
@@ -353,11 +355,11 @@ class DriveService:
         return self.gate.driver, self.gate.estop, self._holder
 
     def look(self, now: float) -> None:
-        """Let the gate look whether this process has stood still, before it handles anything."""
+        """Let the gate check whether this process has stood still, before any message is handled."""
         self.gate.look(now, suspended_ns())
 
     def stop(self) -> None:
-        """Command zero at the end."""
+        """Command zero at shutdown."""
         self.gate.stop(current().steady_s())
         self.settle()
 
@@ -366,18 +368,18 @@ class DriveService:
         verdict = self.gate.receive(client, sequence, age_s, linear, angular, now)
         self.settle()
         if verdict is Verdict.ACCEPTED and self.role_of(client) == "other":
-            return Verdict.NOT_DRIVER  # published all the same: the robot refuses it, and sees that a key is held
+            return Verdict.NOT_DRIVER  # published anyway: the robot refuses it, but must know that a key is held
         return verdict
 
     def stop_robot(self, who: str) -> None:
-        """Set the emergency stop; it is published before this returns."""
+        """Set the emergency stop, which is published before this method returns."""
         self.gate.set_estop(current().steady_s())
         self._backend.on_estop(True)
         self.settle()
         logger.warning("emergency stop from %s", who)
 
     def release_estop(self, client: int) -> bool:
-        """Release the emergency stop; return False if the client is not the driver, who alone may do so."""
+        """Release the emergency stop; return False if the client is not the driver, who alone may release it."""
         if self.role_of(client) == "other" or not self.gate.release_estop(client):
             return False
         self._backend.on_estop(False)
@@ -386,14 +388,14 @@ class DriveService:
         return True
 
     def follow(self, holder: str | None, estop: bool) -> None:
-        """Take over who has the robot's lease (empty: nobody) and its emergency stop; None: no robot reports."""
+        """Follow the robot's lease holder (empty: nobody; None: no robot reports) and its emergency stop."""
         changed = self.gate.follow_estop(None if holder is None else estop, current().steady_s())
         if changed or holder != self._holder:
             self._holder = holder
             self.settle()
 
     def role_of(self, client: int) -> str:
-        """Return who drives, as a client sees it: ``you``, ``other`` or ``none``. The robot decides, if it reports."""
+        """Return who drives from a client's view: ``you``, ``other`` or ``none``. A robot that reports decides."""
         driver = self.gate.driver
         if self._holder and not (driver == client and self._holds(client)):
             return "other"
@@ -402,7 +404,7 @@ class DriveService:
         return "you" if driver == client else "other"
 
     def door(self, clients: Iterable[int]) -> str:
-        """Return the node, and host, through which somebody drives who is none of the clients; else empty."""
+        """Return the node and host through which somebody else than the clients drives; empty if nobody does."""
         if not self._holder or any(self._holds(client) for client in clients):
             return ""
         return self._holder.rpartition("/")[0]

@@ -26,12 +26,12 @@ from instant_ic.util.pace import current
 
 IMAGE_TIMEOUT_S = 2.0
 STATE_PERIOD_S, PLAN_PERIOD_S = 0.05, 0.2
-"""Periods at which mode, poses and commands, and the plan, are sent to the page."""
+"""Periods at which the state (mode, poses, commands) and the plan are sent to the page."""
 
 
 @dataclass(frozen=True)
 class Inputs:
-    """Newest messages of the topics that are read when something is sent."""
+    """Newest messages of the topics that are read when data are sent to the page."""
 
     control: Latest  # ControlState
     vbot: Latest  # Odometry
@@ -43,7 +43,7 @@ class Inputs:
 
 
 class PageFeed:
-    """Feed of the page's server with the messages of a node.
+    """Conversion of a node's messages for the page's server.
 
     Args:
         node: node ``console``.
@@ -51,11 +51,11 @@ class PageFeed:
         display: state of the page's main image.
         inputs: newest messages.
         send_request: function that requests a rendered view.
-        send_shown: function that reports the available images to the arbiter. Called on any thread.
+        send_shown: function that reports the available images to the arbiter. Any thread may call it.
 
     Attributes:
-        watched: true while there is a page. Without one, no state is sent, no view is requested and no report goes to
-            the arbiter.
+        watched: true while there is a page. Without a page, no state is sent, no view is requested and no report goes
+            to the arbiter.
     """
 
     def __init__(
@@ -75,7 +75,7 @@ class PageFeed:
         self._inputs, self._send_request, self._send_shown = inputs, send_request, send_shown
         self._clock, self._diagnose, self._mount = node.clock, node.diagnose, node.config.camera_mount.xyz
         self._meshes = LayerMeshes()
-        self._grids: dict[FrameKind, msg.OccupancyGrid] = {}  # not sent yet
+        self._grids: dict[FrameKind, msg.OccupancyGrid] = {}  # grids that have not been sent yet
         self._sent_grids: dict[FrameKind, PendingFrame] = {}
         self._state_sent_ns = 0
 
@@ -106,32 +106,32 @@ class PageFeed:
         self._request_view()
 
     def layers_of(self, message: msg.VspaceLayers) -> PageLayers | str:
-        """Return the layers that pages render, or an error as text. For a worker thread."""
+        """Return the layers that pages render, or an error as text. Runs on a worker thread."""
         try:
             layers = layers_of(message)
             made = PageLayers(layers.version, self._mount, self._meshes.layers(layers)[:MOST_LAYERS])
             made.check()
-            _ = made.digests  # on this thread: hashing takes milliseconds
+            _ = made.digests  # computed on this thread, because hashing takes milliseconds
             return made
         except ValueError as error:
             return str(error)
 
     def take_layers(self, layers: PageLayers | str) -> None:
-        """Send a version of the virtual space that pages render by themselves; a text says what is wrong with it."""
+        """Send a version of the virtual space that pages render by themselves, or report its error text."""
         if isinstance(layers, str):
-            self._diagnose("layers", ERROR, f"Virtual space not shown: {layers}. The page keeps the one before.")
+            self._diagnose("layers", ERROR, f"Virtual space not shown: {layers}. The page keeps the previous version.")
             return
         self.server.send_layers(layers)
         self._diagnose("layers", OK, "", version=layers.version, layers=len(layers.layers))
 
     def take_control(self, message: msg.ControlState) -> None:
-        """Send a change of mode at once, because both robots keep moving; show who drives, and the emergency stop."""
+        """Send a change of mode at once, because both robots keep moving; show the driver and the emergency stop."""
         self.server.follow_robot(message.holder, bool(message.estop))
         if self.display.changes_mode(message):
             self.send_state()
 
     def take_vbot(self, message: msg.Odometry) -> None:
-        """Send each step of the v-bot at once: the timer would add half a period on average."""
+        """Send each step of the v-bot at once, because the timer would add half a period on average."""
         if self.display.with_vbot:
             self.send_state()
 
@@ -140,7 +140,7 @@ class PageFeed:
         self._grids[kind] = message
 
     def lose_driver(self) -> None:
-        """Report a lost driver to the arbiter at once. Called on the server's thread."""
+        """Report a lost driver to the arbiter at once. Runs on the server's thread."""
         self.display.lose_driver()
         self.report_shown(always=True)
 
@@ -170,13 +170,13 @@ class PageFeed:
         self.server.publish("plan", page.plan_message(self.display.mode == "virtual", *newest))
 
     def send_health(self) -> None:
-        """Send virtual space, battery, CPU of the nodes, and faults in the text of the node that found them."""
+        """Send virtual space, battery, CPU load of the nodes, and faults as reported by the nodes."""
         age_s = self.display.image_age_s
         self._check("camera", age_s <= IMAGE_TIMEOUT_S, "no image from the camera", age_s=age_s)
         self._check("controller", self.display.control.message is not None, "no state from the arbiter")
         self._check("pose", self.display.robot_pose() is not None, "the robot's pose is unknown")
         faults = self.faults.worst()
-        if self.server.plain_http:  # on the page only, not as a diagnosis: the node itself works
+        if self.server.plain_http:  # shown only on the page; not a diagnosis, because the node works
             faults.append({"level": "warn", "name": "network", "text": PLAIN_HTTP})
         newest = self._inputs.vspace.message, self._inputs.battery.message
         self.server.publish("health", page.health_message(*newest, faults, self.faults.nodes(), current().text))
@@ -197,7 +197,7 @@ class PageFeed:
             self._send_shown(self.display.report())
 
     def _request_view(self) -> None:
-        """Request the view that is due: of the v-bot, or else of the robot if the virtual space can render."""
+        """Request the due view: the v-bot's, or otherwise the robot's if the virtual space can render."""
         virtual, needed, now_ns = self.display.with_vbot, self.server.needs_views(), self._clock.steady_ns()
         status = self._inputs.vspace.message
         renders = status is not None and int(status.state) in (msg.VspaceStatus.TRAINING, msg.VspaceStatus.READY)

@@ -15,13 +15,13 @@ def grid_image(grid: NDArray[np.int8], resolution: float, origin_xy: tuple[float
     """Encode the known cells of a grid as a PNG, with a margin of 2 cells.
 
     Args:
-        grid: cells (H, W) int8, -1 unknown, else 0..100; row 0 is the lowest y.
-        resolution: cell size, m.
-        origin_xy: lower left corner of the grid, m.
+        grid: cells, 0 to 100, or -1 if unknown, (H, W) int8; row 0 is the lowest y.
+        resolution: cell size in metres.
+        origin_xy: lower left corner of the grid in metres.
 
     Returns:
-        A grey PNG, whose row 0 is the highest y, with resolution (m), width and height (cells), x and y (m) of the
-        lower left corner in the grid's frame; None if no cell is known.
+        A grey PNG whose row 0 is the highest y. Its header has resolution (m), width and height (cells), and x and y
+        (m) of the lower left corner in the grid's frame. None if no cell is known.
     """
     known_rows = np.flatnonzero((grid >= 0).any(axis=1))
     known_columns = np.flatnonzero((grid >= 0).any(axis=0))

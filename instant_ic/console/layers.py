@@ -1,6 +1,6 @@
 """Layers of the virtual space that the page renders by itself, and the frame that carries them.
 
-A layer is a panorama with depth, as triangles. The layers of seen surfaces come before those of estimated ones behind
+A layer is a panorama with depth, as triangles. Layers of seen surfaces come before layers of estimated surfaces behind
 them.
 """
 
@@ -23,14 +23,14 @@ from instant_ic.vspace.layers import Content, Kind, Layer, Layers, LayersError, 
 from instant_ic.vspace.prior import edge_quads
 
 MOST_LAYERS = 8
-"""Largest number of layers; the page marks each by a bit of its stencil buffer."""
+"""Largest number of layers, because the page marks each layer with a bit of its stencil buffer."""
 EDGE_RATIO = 0.2
-"""Relative difference of depth above which two neighbours are an edge. With noisy depth, a smaller value would tear the
-surface into shards (0.7 dB in the corridor's live keyframes)."""
+"""Relative difference of neighbouring depths above which there is an edge. A smaller value would cut surfaces of noisy
+depth into pieces (a loss of 0.7 dB in the corridor's live keyframes)."""
 
 
 def pose_fields(map_from_camera: Matrix) -> dict[str, list[float]]:
-    """Return a pose as the page reads it: the rotation ``q`` (x, y, z, w) and the position ``p`` in m."""
+    """Return a pose for the page: rotation ``q`` (x, y, z, w) and position ``p`` in metres."""
     return {"q": quaternion_from_matrix(map_from_camera).tolist(), "p": map_from_camera[:3, 3].tolist()}
 
 
@@ -40,8 +40,8 @@ class PageLayer:
 
     Attributes:
         image: colours, JPEG or PNG, equirectangular.
-        confidence: grey PNG, white where the place was seen; empty if all of it was seen.
-        mesh: triangles. An inverse depth of 0 is infinitely far.
+        confidence: grey PNG, white where the surface was seen; empty if the whole surface was seen.
+        mesh: triangles; an inverse depth of 0 is infinitely far.
         map_from_camera: pose of the keyframe's camera, (4, 4).
         gain: factors of the colours: red, green, blue.
     """
@@ -54,7 +54,7 @@ class PageLayer:
 
     @cached_property
     def parts(self) -> dict[str, bytes]:
-        """Bytes of the layer by name, arrays in little endian. Numbers come first, so that they stay aligned."""
+        """Bytes of the layer by name. Arrays are little endian and come first, so that they are aligned."""
         return {
             "inverse": self.mesh.inverse_depth.astype("<f4").tobytes(),
             "triangles": self.mesh.triangles.astype("<u4").tobytes(),
@@ -77,9 +77,9 @@ class PageLayers:
     """One version of the virtual space.
 
     Attributes:
-        version: number of the version, which differs from that of the layers sent before.
-        mount: position of the camera on the robot, m.
-        layers: layers in order; each is shown where the ones before show nothing.
+        version: number of the version, different from that of the layers sent before.
+        mount: position of the camera on the robot in metres.
+        layers: layers in order; each layer is shown where the earlier layers show nothing.
     """
 
     version: int
@@ -87,10 +87,10 @@ class PageLayers:
     layers: tuple[PageLayer, ...]
 
     def check(self) -> None:
-        """Check what comes from a message.
+        """Check the values, which come from a message.
 
         Raises:
-            PageProtocolError: a page could not render it; the text names the field.
+            PageProtocolError: a page could not render the layers; the message names the field.
         """
         _require(1 <= self.version <= 2**53, f"layers.version must be from 1 to 2**53 (got {self.version})")
         _require(
@@ -137,24 +137,24 @@ def _require(fine: bool | np.bool_, text: str) -> None:
 
 
 class LayerMeshes:
-    """The page's layers of each version; a layer that has not changed since the last call is reused."""
+    """Conversion of each version's layers for the page. Layers that have not changed since the last call are reused."""
 
     def __init__(self) -> None:
         self._before: dict[Hashable, PageLayer] = {}
 
     def layers(self, version: Layers) -> tuple[PageLayer, ...]:
-        """Return the layers in the order in which the page shows them: seen surfaces first, then the estimated ones.
+        """Return the layers in the order in which the page shows them: seen surfaces, then estimated surfaces.
 
         Args:
-            version: a whole version of the virtual space.
+            version: a complete version of the virtual space.
 
         Raises:
             LayersError: no layer was seen by a camera, or a layer cannot be decoded.
         """
         if not any(layer.kind is Kind.SEEN for layer in version.layers):
-            raise LayersError("the layers hold no keyframe")
+            raise LayersError("the layers contain no keyframe")
         made: dict[Hashable, PageLayer] = {}
-        for layer in sorted(version.layers, key=lambda layer: layer.kind):  # stable
+        for layer in sorted(version.layers, key=lambda layer: layer.kind):  # stable sort
             key = layer.kind, layer.keyframe_id, layer.colour_version, layer.geometry_version
             made[key] = _layer(layer, self._before.get(key))
         self._before = made
@@ -181,14 +181,14 @@ def page_layer(
     confidence: NDArray[np.floating] | None,
     map_from_camera: Matrix,
 ) -> PageLayer:
-    """Return one panorama with depth as triangles, in its own colours.
+    """Return a panorama with depth as triangles, in its own colours.
 
     Args:
         colour: JPEG or PNG, equirectangular.
-        inverse_depth: in 1/m along the ray, > 0, (h, 2 h).
-        shown: True where there is a surface, (h, 2 h): by pixel, or for an estimated surface by the quad right of and
-            below the pixel.
-        confidence: confidence of an estimated surface, 0 to 1, (h', w'); None if all of it was seen.
+        inverse_depth: inverse depth along the ray in 1/m, > 0, (h, 2 h).
+        shown: mask of the pixels with a surface, (h, 2 h). For estimated surfaces an entry stands for the quad to the
+            lower right of the pixel.
+        confidence: confidence of an estimated surface, 0 to 1, (h', w'); None for a seen surface.
         map_from_camera: pose of the keyframe's camera, (4, 4).
 
     Raises:
@@ -202,5 +202,5 @@ def page_layer(
 
 
 def _confidence_png(confidence: NDArray[np.floating]) -> bytes:
-    """Encode shares (h, w) from 0 to 1 as a grey image."""
+    """Encode confidences (h, w) from 0 to 1 as a grey image."""
     return cv2.imencode(".png", np.rint(255 * confidence).astype(np.uint8))[1].tobytes()

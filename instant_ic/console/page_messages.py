@@ -1,4 +1,4 @@
-"""Messages to the page from the stack's ROS messages; static/messages.js lists their fields."""
+"""Conversion of the stack's ROS messages to messages for the page; static/messages.js lists their fields."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def state_message(at_ms: float, display: Display) -> dict[str, Any]:
 def plan_message(
     virtual: bool, trajectory: Path | None, path: Path | None, subgoal: PoseStamped | None
 ) -> dict[str, Any]:
-    """Return the ``plan`` message; path and subgoal belong to the ``virtual`` mode."""
+    """Return the ``plan`` message. Path and subgoal are sent only in ``virtual`` mode."""
     return {
         "trajectory": points(trajectory),
         "path": points(path) if virtual else [],
@@ -67,7 +67,7 @@ def health_message(
     nodes: list[dict[str, Any]],
     pace: str,
 ) -> dict[str, Any]:
-    """Return the ``health`` message; ``pace`` is empty in real time."""
+    """Return the ``health`` message. ``pace`` is empty in real time."""
     return {"vspace": _vspace(vspace), "battery": _battery(battery), "faults": faults, "nodes": nodes, "pace": pace}
 
 
@@ -89,12 +89,12 @@ def _battery(battery: BatteryState | None) -> dict[str, Any] | None:
     voltage = None if battery is None else finite(battery.voltage)
     if battery is None or voltage is None:
         return None
-    share = finite(battery.percentage)  # 0..1; NaN where unknown (sensor_msgs/BatteryState)
+    share = finite(battery.percentage)  # 0 to 1; NaN if unknown (sensor_msgs/BatteryState)
     return {"voltage": voltage, "percent": None if share is None else 100.0 * share}
 
 
 def image_header(captured_ms: float, map_from_camera: Matrix | None) -> dict[str, Any]:
-    """Return the header of a panorama's frame, or the first part of that of a rendered view."""
+    """Return the header of a panorama's frame, or the first part of a rendered view's header."""
     pose = {"q": None, "p": None} if map_from_camera is None else pose_fields(map_from_camera)
     return {"captured_ms": captured_ms, **pose}
 
@@ -106,12 +106,12 @@ def finite(value: Any) -> float | None:
 
 
 def planar(pose: Matrix | None) -> list[float] | None:
-    """Return [x, y, yaw] of a pose, m and rad; None without one."""
+    """Return [x, y, yaw] of a pose in m and rad; None if there is no pose."""
     return None if pose is None else [round(float(value), 4) for value in pose2_from_matrix(pose)]
 
 
 def points(path: Path | None) -> list[list[float]]:
-    """Return the points [x, y] of a path in the map frame, rounded to 1 mm; empty without one in this frame."""
+    """Return the points [x, y] of a path in the map frame, rounded to 1 mm; empty for another frame or no path."""
     if path is None or not path.poses or path.header.frame_id not in ("", "map"):
         return []
     xy = path_array(path)[:, :2]

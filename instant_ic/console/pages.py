@@ -1,4 +1,4 @@
-"""WebSockets of the operators' pages: what each is sent, and what its messages do."""
+"""WebSockets of the operators' pages: sending of data, and handling of the pages' messages."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ from instant_ic.control.robot_lease import Verdict
 from instant_ic.util.pace import current
 from instant_ic.util.web_access import TokenBucket
 
-EXPIRY_S = 1.0  # between two searches for expired sign-ins
+EXPIRY_S = 1.0  # time between two searches for expired sign-ins
 MAX_CLIENT_MESSAGE = 4096  # bytes
-BURST_S = 2.0  # seconds' worth of messages that may arrive at once, after a radio link has stalled
-FIRST_S = 0.25  # the same for a new page
+BURST_S = 2.0  # messages of this many seconds may arrive at once, after a radio link has stalled
+FIRST_S = 0.25  # as BURST_S, for a new page
 WATCHER_SHARE = 0.4  # share of max_messages_per_s for a page that does not drive
-RESERVED_FOR_DRIVERS = 2  # places of max_clients that pages which may only watch cannot take
+RESERVED_FOR_DRIVERS = 2  # number of max_clients reserved for pages that may drive
 SILENT_CLIENT_S = 15.0
-SUPERSEDED_S = 5.0  # time for a page to load new layers; what it still renders from older ones does not count as a view
+SUPERSEDED_S = 5.0  # time for a page to load new layers; images of older layers then no longer count as views
 logger = logging.getLogger("instant_ic.console")
 
 
@@ -41,7 +41,7 @@ def now_ms() -> float:
 
 
 class Pages:
-    """Sends data to the pages, and hands their messages on. Used on the server's loop, except where noted.
+    """The pages' WebSockets, which send data and handle messages. Used on the server's loop, unless noted.
 
     Args:
         backend: handles the operators' actions.
@@ -69,26 +69,26 @@ class Pages:
         self._next_number = 1
         self._texts: dict[str, str] = {}
         self._frames: dict[FrameKind, PendingFrame | PageLayers] = {}
-        self._versions: dict[int, float] = {}  # of layers -> when the next one superseded it; inf: not yet
+        self._versions: dict[int, float] = {}  # version of layers → time of the next version; inf: none yet
         self._foreground = frozenset({FrameKind.PANORAMA})
 
     # ---- to the pages -----------------------------------------------------------------------
 
     def publish(self, kind: str, text: str) -> None:
-        """Send a text message to every page; it replaces a pending one of this kind."""
+        """Send a text message to every page. It replaces a pending message of the same kind."""
         self._texts[kind] = text
         for session in self.sessions.values():
             session.put_text(kind, text)
 
     def send_frame(self, kind: FrameKind, frame: PendingFrame) -> None:
-        """Send an image or map to every page that needs it; it replaces a pending one of this kind."""
+        """Send an image or map to every page that needs it. It replaces a pending frame of the same kind."""
         self._frames[kind] = frame
         for session in self.sessions.values():
             if kind is not FrameKind.VIEW or session.drawn is None:
                 session.put_frame(kind, frame)
 
     def send_layers(self, layers: PageLayers) -> None:
-        """Send a version of the virtual space to every page; it replaces a pending one."""
+        """Send a version of the virtual space to every page. It replaces a pending version."""
         now = time.monotonic()
         self._versions = {
             version: min(since, now)
@@ -101,7 +101,7 @@ class Pages:
             session.put_frame(FrameKind.LAYERS, layers)
 
     def show(self, kinds: frozenset[FrameKind]) -> None:
-        """Set which of PANORAMA and VIEW the pages show; the other is sent at a low rate."""
+        """Set which of PANORAMA and VIEW the pages show. The other is sent at a low rate."""
         if kinds == self._foreground:
             return
         self._foreground = kinds
@@ -109,16 +109,16 @@ class Pages:
             session.set_foreground(kinds, 1.0 / self._config.background_picture_hz)
 
     def drawn_ms(self) -> float | None:
-        """Return the time (:func:`now_ms`) of the newest state that a page has shown, rendering the v-space by itself.
+        """Return the time (:func:`now_ms`) of the newest state that the driver's page has rendered by itself.
 
-        The page is the driver's, or without a driver the oldest. None: it needs rendered views. Any thread may call it.
+        Without a driver, the oldest page counts. None if the page needs rendered views. Any thread may call this.
         """
         sessions = self.sessions.copy()
         driver = sessions.get(self._drive.gate.driver or 0) or next(iter(sessions.values()), None)
         return None if driver is None or driver.drawn is None else driver.drawn[1]
 
     def needs_views(self) -> bool:
-        """Return whether a page does not render the virtual space by itself. Any thread may call it."""
+        """Return whether there is a page that does not render the virtual space by itself. Any thread may call this."""
         return any(session.drawn is None for session in self.sessions.copy().values())
 
     # ---- connections ------------------------------------------------------------------------
@@ -127,9 +127,9 @@ class Pages:
         """Serve a page's WebSocket until it closes.
 
         Args:
-            request: the upgrade request, whose sign-in and origin are checked already.
-            may_drive: whether the sign-in permits more than to watch and stop.
-            cookie: cookie of the sign-in; empty without one, or for a sign-in by token.
+            request: the upgrade request, whose sign-in and origin have been checked.
+            may_drive: True if the sign-in permits more than to watch and stop.
+            cookie: cookie of the sign-in; empty without a sign-in, or for a sign-in by token.
         """
         places = self._config.max_clients if may_drive else max(1, self._config.max_clients - RESERVED_FOR_DRIVERS)
         if len(self.sessions) >= places:
@@ -137,10 +137,10 @@ class Pages:
         assert request.transport is not None
         connection = request.transport.get_protocol()
         assert isinstance(connection, LimitedConnection)
-        # Without autoping the reader sees the protocol's pings too, so that the message limit covers them.
+        # Without autoping the reader receives the protocol's pings too, so that the message limit covers them.
         socket = web.WebSocketResponse(max_msg_size=MAX_CLIENT_MESSAGE, compress=False, timeout=CLOSE_S, autoping=False)
         limit = self._config.max_messages_per_s
-        # A new connection has no delayed messages: a client must not gain a new burst by reconnecting.
+        # A new connection has no delayed messages, and a client must not gain a new burst by reconnecting.
         bucket = TokenBucket(limit, limit * BURST_S, limit * FIRST_S)
         session = PageSession(self._next_number, socket, connection, bucket, may_drive, cookie)
         self._next_number += 1
@@ -149,7 +149,7 @@ class Pages:
             self._backend.on_watched(True)
         sender: asyncio.Task[None] | None = None
         try:
-            await socket.prepare(request)  # raises if the request is no WebSocket upgrade
+            await socket.prepare(request)  # raises if the request is not a WebSocket upgrade
             connection.keep(lambda: self._end_flood(session))
             self._greet(session)
             sender = asyncio.create_task(session.send_forever())
@@ -172,7 +172,7 @@ class Pages:
         await asyncio.gather(*(session.closing for session in sessions if session.closing is not None))
 
     def end_signed_out(self) -> None:
-        """End the sessions whose sign-in has ended: signed out, expired or displaced by newer ones."""
+        """End the sessions whose sign-in has ended: signed out, expired or displaced by newer sign-ins."""
         now = time.monotonic()
         for session in list(self.sessions.values()):
             if self._access.required and session.cookie and self._access.role_of_session(session.cookie, now) is None:
@@ -186,7 +186,7 @@ class Pages:
             self.end_signed_out()
 
     def _drop(self, session: PageSession) -> None:
-        """Remove a session: it loses the lease and receives nothing more."""
+        """Remove a session, which loses the lease and receives nothing more."""
         if self.sessions.pop(session.number, None) is None:
             return
         self._drive.gate.forget(session.number, current().steady_s())
@@ -196,19 +196,19 @@ class Pages:
             self._backend.on_watched(False)
 
     def _end(self, session: PageSession, code: WSCloseCode, reason: str) -> None:
-        """Drop a session at once, then close its socket whatever the client does."""
+        """Drop a session at once, then close its socket even if the client does not respond."""
         self._drop(session)
         if session.closing is None:
             session.closing = asyncio.create_task(_close(session, code, reason))
 
     def _end_flood(self, session: PageSession) -> None:
-        """End a session that sends more than a page ever does."""
+        """End a session that sends more than a page would."""
         logger.warning("client %d closed: it sends too many messages", session.number)
         session.connection.mute()
         self._end(session, WSCloseCode.POLICY_VIOLATION, "too many messages")
 
     def _greet(self, session: PageSession) -> None:
-        """Send a new page everything that the others have already."""
+        """Send a new page everything that the other pages have received."""
         drive = self._config.drive
         session.reply(
             {
@@ -227,7 +227,7 @@ class Pages:
         self._send_session()
 
     def _send_session(self, only: PageSession | None = None) -> None:
-        """Send the state of the lease to all pages, or to one."""
+        """Send the state of the lease to all pages, or to one page."""
         for session in list(self.sessions.values()) if only is None else [only]:
             message = {
                 "type": "session",
@@ -248,9 +248,9 @@ class Pages:
             except TimeoutError:
                 self._end(session, WSCloseCode.POLICY_VIOLATION, "silent")
                 return
-            if session.number not in self.sessions:  # ended meanwhile
+            if session.number not in self.sessions:  # the session has ended in the meantime
                 return
-            # A watcher sends no commands, only pings and looks.
+            # A watcher sends no commands, only pings and look directions.
             session.bucket.rate = limit if session.number == self._drive.gate.driver else limit * WATCHER_SHARE
             within = session.bucket.take(time.monotonic())
             if message.type is WSMsgType.TEXT:
@@ -267,10 +267,10 @@ class Pages:
             elif session.chokes:
                 session.connection.mute()
                 self._end(session, WSCloseCode.POLICY_VIOLATION, "does not read its answers")
-            await asyncio.sleep(0)  # one message a turn, so that clients take turns
+            await asyncio.sleep(0)  # one message per turn, so that clients take turns
 
     def _take(self, session: PageSession, text: str, now: float, *, only_a_stop: bool) -> None:
-        """Handle one message; an emergency stop is handled even above the message limit."""
+        """Handle one message. An emergency stop is handled even above the message limit."""
         self._drive.look(now)
         try:
             message = parse_text(text)
@@ -281,7 +281,7 @@ class Pages:
             session.reply({"type": "error", "text": str(error)})
 
     def handle(self, session: PageSession, message: dict[str, Any], now: float) -> None:
-        """Handle a page's message at a steady time; raise PageProtocolError if it is wrong."""
+        """Handle a page's message at a steady time. Raise PageProtocolError if the message is wrong."""
         kind = message["type"]
         handler = {
             "ping": self._on_ping,
@@ -301,7 +301,7 @@ class Pages:
             raise PageProtocolError(f"unknown message type {kind!r:.40}")
         if kind == "ping":
             session.away = flag(message, "away", False)
-        # A hidden page keeps acknowledging images; that is no sign of an operator either.
+        # A hidden page keeps acknowledging images, so acknowledgements do not show that an operator is present.
         if self._drive.gate.touch(session.number, now, away=session.away):
             self._drive.settle()
         handler(session, message, now)
@@ -322,7 +322,7 @@ class Pages:
         age_s = (now_ms() - number(message, "time_ms")) / 1000.0 * current().factor
         linear, angular = number(message, "linear"), number(message, "angular")
         verdict = self._drive.command(session.number, whole(message, "seq"), age_s, linear, angular, now)
-        # A zero needs no permission and is harmless out of order, so only refused motion is reported.
+        # Zero needs no permission and is harmless out of order, so only refused motion is reported.
         if verdict is not Verdict.ACCEPTED and (linear, angular) != (0.0, 0.0):
             _refuse(session, verdict.name.lower(), verdict.value)
 
@@ -367,7 +367,7 @@ class Pages:
         except ValueError as error:
             raise PageProtocolError(f"ack.kind: {error}") from None
         if session.acknowledge(kind, whole(message, "seq"), flag(message, "loaded", True)):
-            session.bucket.give_back()  # acknowledgements are limited by the server's own frames
+            session.bucket.give_back()  # acknowledgements are already limited by the server's frames
 
     def _on_drawn(self, session: PageSession, message: dict[str, Any], now: float) -> None:
         version, state_ms = whole(message, "version"), number(message, "state_ms", 0.0, now_ms())
@@ -376,7 +376,7 @@ class Pages:
             session.drawn = None
         else:
             current_version = time.monotonic() - self._versions.get(version, float("-inf")) < SUPERSEDED_S
-            # Of outdated layers no new state counts as shown: the view ages until it is stale.
+            # No new state counts as shown with outdated layers, so that the view ages until it is stale.
             shown_ms = state_ms if current_version else 0.0 if session.drawn is None else session.drawn[1]
             session.drawn = version, shown_ms
         if self.drawn_ms() != before:
@@ -388,18 +388,18 @@ def _refuse(session: PageSession, reason: str, text: str) -> None:
 
 
 def _may_drive(session: PageSession) -> bool:
-    """Return whether the sign-in may do more than watch and stop; if not, send a refusal."""
+    """Return whether the sign-in permits more than to watch and stop; if not, send a refusal."""
     if not session.may_drive:
         _refuse(session, "watch_only", "this sign-in may only watch")
     return session.may_drive
 
 
 async def _close(session: PageSession, code: WSCloseCode, reason: str) -> None:
-    """Close a socket, or cut it if the client takes no closing frame."""
+    """Close a socket, or cut it if the client accepts no closing frame."""
     try:
         async with asyncio.timeout(2 * CLOSE_S):
             await session.socket.close(code=code, message=reason.encode())
     except (TimeoutError, ConnectionError, RuntimeError) as error:
-        logger.debug("client %d took no closing frame: %s", session.number, error)
+        logger.debug("client %d accepted no closing frame: %s", session.number, error)
     finally:
         session.connection.abort()

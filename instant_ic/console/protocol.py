@@ -9,9 +9,9 @@ Binary frame, little endian::
     offset 8   uint32  length of the header, bytes
     offset 12          header: JSON, UTF-8
     then               payload: JPEG or PNG; for LAYERS the parts of all layers, by the ranges in the header; for PART
-                       a piece of a whole frame from ``start`` on, which has ``size`` bytes
+                       a piece, from byte ``start`` on, of a frame with ``size`` bytes
 
-docs/console.md lists the messages, static/messages.js the fields of those to the page and of the headers.
+docs/console.md lists the messages. static/messages.js lists the fields of the headers and of messages to the page.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ PREFIX = struct.Struct("<BBHII")
 
 
 class PageProtocolError(ValueError):
-    """A message violates the protocol; the text names the field and its value."""
+    """A message violates the protocol; the error names the field and its value."""
 
 
 class FrameKind(IntEnum):
@@ -54,13 +54,13 @@ class PageFrame:
 
 @dataclass(frozen=True)
 class PendingFrame:
-    """A frame without a sequence number; ``payload`` is JPEG or PNG."""
+    """A frame that has no sequence number yet; ``payload`` is JPEG or PNG."""
 
     header: dict[str, Any]
     payload: bytes
 
     def frame(self, held: frozenset[str]) -> tuple[dict[str, Any], bytes]:
-        """Return header and payload, as ``PageLayers.frame`` does."""
+        """Return header and payload, like ``PageLayers.frame``."""
         return self.header, self.payload
 
 
@@ -74,7 +74,7 @@ def decode_frame(data: bytes) -> PageFrame:
     """Decode one binary WebSocket message.
 
     Raises:
-        PageProtocolError: too short, unknown version or kind, or the header is not a JSON object.
+        PageProtocolError: the message is too short or of unknown version or kind, or its header is not a JSON object.
     """
     if len(data) < PREFIX.size:
         raise PageProtocolError(f"binary frame of {len(data)} bytes is shorter than its prefix of {PREFIX.size} bytes")
@@ -95,16 +95,16 @@ def decode_frame(data: bytes) -> PageFrame:
 
 
 class Parts:
-    """Assembler of a frame that comes in pieces, in order."""
+    """Assembler of a frame that arrives in pieces, in order."""
 
     def __init__(self) -> None:
         self._data = bytearray()
 
     def take(self, part: PageFrame) -> PageFrame | None:
-        """Take a piece; return the frame once it is complete.
+        """Add a piece; return the frame once it is complete.
 
         Raises:
-            PageProtocolError: a piece is missing, or the pieces do not make a frame.
+            PageProtocolError: a piece is missing, or the pieces do not form a frame.
         """
         start, size = part.header.get("start"), part.header.get("size")
         if start == 0:
@@ -120,7 +120,7 @@ class Parts:
 
 
 def parse_text(text: str) -> dict[str, Any]:
-    """Parse a JSON object with a string ``type``; raise PageProtocolError for anything else."""
+    """Parse a JSON object with a string ``type``. Raise PageProtocolError for anything else."""
     try:
         message = json.loads(text)
     except (ValueError, RecursionError) as error:
@@ -131,9 +131,9 @@ def parse_text(text: str) -> dict[str, Any]:
 
 
 def number(message: dict[str, Any], key: str, low: float = -math.inf, high: float = math.inf) -> float:
-    """Return ``message[key]`` as a finite number in [low, high]; raise PageProtocolError otherwise."""
+    """Return ``message[key]`` as a finite number in [low, high]. Raise PageProtocolError if it is not."""
     value = message.get(key)
-    # json.loads accepts NaN, Infinity and integers of any length; none of them may reach a motor.
+    # json.loads accepts NaN, Infinity and integers of any length, which must not reach a motor.
     if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(_as_float(value)):
         raise PageProtocolError(f"{message['type']}.{key} must be a finite number (got {value!r:.40})")
     if not low <= value <= high:
@@ -142,7 +142,7 @@ def number(message: dict[str, Any], key: str, low: float = -math.inf, high: floa
 
 
 def whole(message: dict[str, Any], key: str) -> int:
-    """Return ``message[key]`` as an integer in [0, 2**53]; raise PageProtocolError otherwise."""
+    """Return ``message[key]`` as an integer in [0, 2**53]. Raise PageProtocolError if it is not."""
     value = message.get(key)
     if isinstance(value, bool) or not isinstance(value, int) or not 0 <= value <= 2**53:
         raise PageProtocolError(f"{message['type']}.{key} must be an integer from 0 to 2**53 (got {value!r:.40})")
@@ -150,7 +150,7 @@ def whole(message: dict[str, Any], key: str) -> int:
 
 
 def flag(message: dict[str, Any], key: str, default: bool | None = None) -> bool:
-    """Return ``message[key]`` as a bool; raise PageProtocolError for another type or a missing key without default."""
+    """Return ``message[key]`` as a bool. Raise PageProtocolError for another type, or a missing key without default."""
     value = message.get(key, default)
     if not isinstance(value, bool):
         raise PageProtocolError(f"{message['type']}.{key} must be true or false (got {value!r:.40})")

@@ -14,18 +14,18 @@ logger = logging.getLogger("instant_ic.console")
 
 
 class RecorderError(RuntimeError):
-    """The recorder refused or did not answer; the text is for the operator."""
+    """The recorder refused or did not answer; the message is for the operator."""
 
 
 class RecordingDesk:
-    """Caller of the recorder, with a thread of its own: an answer may take seconds, and the page must not wait.
+    """Caller of the recorder on a separate thread, because an answer may take seconds and the page must not wait.
 
-    Any thread may call its methods. Each ends with a new report.
+    Any thread may call its methods. Each command ends with a new report.
 
     Args:
         ask: function that calls a command of the recorder (``record``, ``stop``, ``snapshot`` or ``status``) with named
-            arguments and returns the answer; raises RecorderError if there is none or the recorder refuses.
-        report: function that takes the page's ``recording`` message.
+            arguments and returns the answer; raises RecorderError if the recorder refuses or does not answer.
+        report: function that receives the page's ``recording`` message.
     """
 
     def __init__(self, ask: Callable[..., Any], report: Callable[[dict[str, Any]], None]) -> None:
@@ -38,7 +38,7 @@ class RecordingDesk:
         self._notice: dict[str, Any] = {"number": 0, "text": "", "level": "ok"}
 
     def stop(self) -> None:
-        """Stop the thread; drop pending commands."""
+        """Stop the thread, and drop pending commands."""
         self._thread.shutdown(cancel_futures=True)
 
     def record(self, on: bool) -> None:
@@ -55,7 +55,7 @@ class RecordingDesk:
         self._submit(lambda: f"Bookmark set: {name}" + ("" if self._recording else " (not recording)"))
 
     def poll(self) -> None:
-        """Report the recorder's state, unless the recorder has not answered the last poll yet."""
+        """Report the recorder's state, unless the answer to the last poll is still pending."""
         if self._poll is None or self._poll.done():
             self._poll = self._thread.submit(self._do, None)
 

@@ -1,9 +1,9 @@
 """HTTP server of the operator's page, in its own thread.
 
-It does not depend on the bus. Data for the page comes through the methods of :class:`ConsoleServer`, which any thread
-may call. :class:`ConsoleServer` answers HTTP requests, :class:`~instant_ic.console.pages.Pages` serves the
+The server does not depend on the bus. Data for the page are passed by the methods of :class:`ConsoleServer`, which any
+thread may call. :class:`ConsoleServer` answers HTTP requests, :class:`~instant_ic.console.pages.Pages` serves the
 WebSockets, and :class:`~instant_ic.console.drive.DriveService` passes commands to the robot. The operator's actions
-go to a :class:`~instant_ic.console.backend.ConsoleBackend`.
+are passed to a :class:`~instant_ic.console.backend.ConsoleBackend`.
 """
 
 from __future__ import annotations
@@ -34,9 +34,9 @@ from instant_ic.util.web_access import AddressBuckets, host_allowed, is_loopback
 
 STATIC = Path(__file__).parent / "static"
 MAX_BODY = 4096  # bytes
-REQUESTS_PER_S = 40.0  # of one address; a page with its modules takes about 25
+REQUESTS_PER_S = 40.0  # per address; a page with its modules needs about 25 requests
 BURST_REQUESTS = 150.0
-SOCKETS_PER_S = 5.0  # WebSockets opened by one address; a new one is sent everything that is shown
+SOCKETS_PER_S = 5.0  # WebSockets opened per address; limited, because each is sent everything that is shown
 BURST_SOCKETS = 20.0
 START_TIMEOUT_S = 10.0
 SECURITY_HEADERS = {
@@ -50,16 +50,16 @@ SECURITY_HEADERS = {
 PLAIN_HTTP = "Plain HTTP: anyone on the network can read the traffic and take over. Set server.access.tls_certificate."
 logger = logging.getLogger("instant_ic.console")
 _COOKIE: web.RequestKey[str] = web.RequestKey("cookie", str)
-_PAYER: web.RequestKey[str] = web.RequestKey("payer", str)  # whose rate a request counts against
+_PAYER: web.RequestKey[str] = web.RequestKey("payer", str)  # sign-in or address whose rate includes the request
 _ROLE: web.RequestKey[Role | None] = web.RequestKey("role", Role | None)  # type: ignore[arg-type]
 
 
 class ConsoleError(RuntimeError):
-    """The server cannot start or stop; the text says why and what to do."""
+    """The server cannot start or stop; the message says why and what to do."""
 
 
 class ConsoleServer(PageServer):
-    """Serves the page and its WebSocket at ``/ws``.
+    """The server of the page and its WebSocket at ``/ws``.
 
     Args:
         backend: handles the operator's actions.
@@ -73,7 +73,7 @@ class ConsoleServer(PageServer):
         port: port on which the server listens; 0 before the start.
 
     Raises:
-        ConsoleError: token or certificate cannot be used.
+        ConsoleError: a token or a certificate cannot be used.
     """
 
     now_ms = staticmethod(now_ms)
@@ -102,7 +102,7 @@ class ConsoleServer(PageServer):
     # ---- any thread -------------------------------------------------------------------------
 
     def start(self) -> None:
-        """Bind the port and serve; raise ConsoleError if that fails."""
+        """Bind the port and serve. Raise ConsoleError if the port cannot be bound or the server does not start."""
         self._thread = threading.Thread(target=self._run, name="console-server", daemon=True)
         self._thread.start()
         if not self._started.wait(START_TIMEOUT_S):
@@ -118,7 +118,7 @@ class ConsoleServer(PageServer):
         if self._thread is None:
             return
         if self._loop is not None and self._thread.is_alive():
-            # The loop may end between the check and the call.
+            # The loop may have ended between the check and the call.
             with contextlib.suppress(RuntimeError):
                 self._loop.call_soon_threadsafe(self._finish.set)
         self._thread.join(timeout=5.0)
@@ -139,14 +139,14 @@ class ConsoleServer(PageServer):
 
     @property
     def warnings(self) -> list[str]:
-        """Warnings for the log: access that the parameters leave open."""
+        """Warnings for the log about access that the parameters leave open."""
         who = "every user of this machine" if is_loopback(self.config.host) else "anyone on the network"
         unguarded = f"{who} may drive, because server.access.sign_in is never"
         return [PLAIN_HTTP] * self.plain_http + [unguarded] * self.access.unguarded
 
     @property
     def sign_in_url(self) -> str:
-        """Address of the page, with the token if this start made one; opening it signs in."""
+        """Address of the page, with the token if this start made one. Opening the address signs in."""
         token = self.access.made_token
         return f"{self.url}?token={quote(token)}" if token else self.url
 
@@ -175,7 +175,7 @@ class ConsoleServer(PageServer):
     def _call(self, function: Callable[..., None], *args: Any) -> None:
         if self._loop is None:
             return
-        # After stop() the loop is closed and nobody listens.
+        # After stop() the loop is closed, and the call has no receiver.
         with contextlib.suppress(RuntimeError):
             self._loop.call_soon_threadsafe(function, *args)
 
@@ -197,8 +197,8 @@ class ConsoleServer(PageServer):
             access_log=None,
             handle_signals=False,
             shutdown_timeout=1.0,
-            keepalive_timeout=HEADERS_S,  # from the start of the connection, then from each answer
-            lingering_time=CLOSE_S,  # for the rest of a refused body
+            keepalive_timeout=HEADERS_S,  # counted from the start of the connection, then from each answer
+            lingering_time=CLOSE_S,  # time for the rest of a refused body
         )
         await runner.setup()
         assert runner.server is not None
@@ -234,7 +234,7 @@ class ConsoleServer(PageServer):
     async def _guard(
         self, request: web.Request, handler: Callable[[web.Request], Awaitable[web.StreamResponse]]
     ) -> web.StreamResponse:
-        # The sign-in comes first: a signed-in client never waits for others of the same address.
+        # The sign-in is checked first, so that a signed-in client never waits for others with the same address.
         request[_COOKIE] = request.cookies.get(COOKIE, "")
         request[_PAYER] = network_of(request.remote or "")
         request[_ROLE] = role = self._role(request)
@@ -250,7 +250,7 @@ class ConsoleServer(PageServer):
         return await (self._turn_away(request) if role is None and not open_to_all else handler(request))
 
     def _role(self, request: web.Request) -> Role | None:
-        """Return the role of a request: programs send a token in the header, pages the cookie of their sign-in."""
+        """Return the role of a request. Programs send a token in the header, pages the cookie of their sign-in."""
         if not self.access.required:
             return Role.DRIVE
         token = _bearer(request.headers.get("Authorization", ""))
@@ -262,9 +262,9 @@ class ConsoleServer(PageServer):
         return role
 
     def _known(self, received: bytes) -> bool:
-        """Return whether a request has a right token or cookie in its headers; without sign-in, whether it is a stop.
+        """Return whether a request's headers contain a valid token or cookie, or without sign-in, whether it is a stop.
 
-        This only admits a connection: :meth:`_guard` decides on the request.
+        This only admits a connection. :meth:`_guard` decides on the request.
         """
         if not self.access.required:
             return received.startswith(b"POST /estop ")
@@ -281,7 +281,7 @@ class ConsoleServer(PageServer):
         await asyncio.sleep(self.access.count_wrong_token(address, time.monotonic()))
 
     async def _turn_away(self, request: web.Request) -> web.StreamResponse:
-        """Answer a request without sign-in: the form for browsers that open the page, 401 for everything else."""
+        """Answer a request without sign-in: with the form if a browser opens the page, otherwise with 401."""
         if request.path == "/" and request.method == "GET":
             if token := request.query.get("token", ""):
                 return await self._enter(request, token)
@@ -294,7 +294,7 @@ class ConsoleServer(PageServer):
         )  # fmt: skip
 
     async def _enter(self, request: web.Request, token: str) -> web.Response:
-        """Sign a browser in: set a cookie and redirect, so that the token leaves address and history."""
+        """Sign a browser in: set a cookie and redirect, so that the token disappears from address and history."""
         role = self.access.role_of_token(token)
         if role is None:
             await _pace(request, self._requests)
@@ -305,7 +305,7 @@ class ConsoleServer(PageServer):
             COOKIE, self.access.open_session(role, time.monotonic()), httponly=True, samesite="Strict",
             secure=self._tls is not None, max_age=round(self.config.access.session_hours * 3600),
         )  # fmt: skip
-        self.pages.end_signed_out()  # pages whose sign-in the new one displaced
+        self.pages.end_signed_out()  # the new sign-in may have displaced others
         logger.info("%s has signed in to %s", request.remote, role.value)
         return response
 
@@ -331,7 +331,7 @@ class ConsoleServer(PageServer):
         raise response
 
     async def _index(self, request: web.Request) -> web.StreamResponse:
-        if "token" in request.query:  # already signed in: remove the token from the address
+        if "token" in request.query:  # already signed in, so remove the token from the address
             raise web.HTTPSeeOther("/")
         return web.FileResponse(STATIC / "index.html")
 
@@ -339,7 +339,7 @@ class ConsoleServer(PageServer):
         return web.json_response({"clients": len(self.pages.sessions)})
 
     async def _estop(self, request: web.Request) -> web.StreamResponse:
-        """Set the emergency stop without the page's WebSocket, which may be stuck but alone can release it."""
+        """Set the emergency stop without the page's WebSocket, which may be stuck; only the page can release it."""
         _check_origin(request)
         self.drive.stop_robot(request.remote or "")
         return web.Response(status=204)
@@ -352,7 +352,7 @@ class ConsoleServer(PageServer):
 
 
 async def _pace(request: web.Request, buckets: AddressBuckets) -> None:
-    """Delay requests of a sign-in or address above its rate; the connection limit bounds how many wait."""
+    """Delay requests of a sign-in or address above its rate. The limit of connections bounds the waiting requests."""
     bucket = buckets.of(request[_PAYER])
     while not bucket.take(time.monotonic()):
         await asyncio.sleep(bucket.wait_s())
@@ -379,19 +379,19 @@ def _bearer(authorization: str) -> str:
 
 
 def _end_if_left(request: web.Request) -> None:
-    """End a request whose client has closed its connection: no limit counts it any more."""
+    """End a request whose client has closed its connection, because no limit counts it any more."""
     if request.transport is None:
         raise web.HTTPRequestTimeout
 
 
 async def _secure_headers(request: web.Request, response: web.StreamResponse) -> None:
-    """Add the security headers to every response, errors included."""
+    """Add the security headers to every response, including errors."""
     for name, value in SECURITY_HEADERS.items():
         response.headers.setdefault(name, value)
 
 
 def origin_allowed(origin: str | None, host: str) -> bool:
-    """Return whether a request comes from the page itself; programs send no Origin and are accepted."""
+    """Return whether a request comes from the page itself. Programs send no Origin and are accepted."""
     if origin is None:
         return True
     try:

@@ -1,4 +1,4 @@
-"""Send queue of one page. It keeps only the newest message of each kind, so that a slow page delays no other."""
+"""Send queue of one page. It keeps only the newest message of each kind, so that a slow page does not delay others."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ from instant_ic.console.layers import PageLayers
 from instant_ic.console.protocol import FrameKind, PageFrame, PendingFrame, encode_frame
 from instant_ic.util.web_access import TokenBucket
 
-MAX_REPLIES = 256  # pending, about one second of a page's traffic; a client with more does not read
-# Smallest first: an image must not delay the state, nor a map an image.
+MAX_REPLIES = 256  # pending replies, about one second of a page's traffic; a client with more does not read
+# Smallest first, because an image must not delay the state, nor a map an image.
 FRAME_ORDER = (FrameKind.VIEW, FrameKind.PANORAMA, FrameKind.LAYERS, FrameKind.MAP, FrameKind.COSTMAP)
-PART_BYTES = 64 * 1024  # a larger frame of layers is sent in pieces: on a slow link it would hold up pongs for seconds
+PART_BYTES = 64 * 1024  # larger frames of layers are sent in pieces, which delay pongs less on a slow link
 
 
 @dataclass(eq=False)
@@ -31,12 +31,12 @@ class PageSession:
 
     Attributes:
         bucket: limits the client's messages.
-        cookie: cookie of the sign-in; the session ends with it. Empty without a sign-in, or for one by token.
+        cookie: cookie of the sign-in, with which the session ends; empty without a sign-in, or for a sign-in by token.
         closing: closing handshake, once the session has ended.
         chokes: true if too many replies are pending, which means that the client does not read.
-        away: true if the page is hidden or its operator types.
+        away: true if the page is hidden or its operator is typing.
         drawn: version of the layers that the page renders by itself, and time of the newest state that it has shown
-            (server's clock, ms); None: it needs rendered views.
+            (server's clock, ms); None if the page needs rendered views.
     """
 
     number: int
@@ -50,20 +50,20 @@ class PageSession:
     away: bool = False
     drawn: tuple[int, float] | None = None
     _held: frozenset[str] = frozenset()  # digests of the layers that the page holds
-    _offered: frozenset[str] = frozenset()  # of the layers sent last
+    _offered: frozenset[str] = frozenset()  # digests of the layers sent last
     _replies: deque[str] = field(default_factory=deque)
     _texts: dict[str, str] = field(default_factory=dict)
     _frames: dict[FrameKind, PendingFrame | PageLayers] = field(default_factory=dict)
     _sent_frames: Counter[FrameKind] = field(default_factory=Counter)
     _unacknowledged: dict[FrameKind, int] = field(default_factory=dict)
-    _parts: deque[PageFrame] = field(default_factory=deque)  # of the layers being sent; not numbered yet
+    _parts: deque[PageFrame] = field(default_factory=deque)  # remaining parts of the layers being sent, not numbered
     _last_sent: dict[FrameKind, float] = field(default_factory=dict)
     _foreground: frozenset[FrameKind] = frozenset({FrameKind.PANORAMA})
     _background_period_s: float = 0.0
     _wake: asyncio.Event = field(default_factory=asyncio.Event)
 
     def reply(self, message: dict[str, Any]) -> None:
-        """Queue an answer that must not be lost. If the queue is full, set ``chokes``; the session must then end."""
+        """Queue an answer that must not be lost. If the queue is full, set ``chokes``, and the session must end."""
         if len(self._replies) >= MAX_REPLIES:
             self.chokes = True
             return
@@ -71,12 +71,12 @@ class PageSession:
         self._wake.set()
 
     def put_text(self, key: str, text: str) -> None:
-        """Queue ``text``, replacing a pending one of the same key."""
+        """Queue ``text``. It replaces a pending text of the same key."""
         self._texts[key] = text
         self._wake.set()
 
     def put_frame(self, kind: FrameKind, frame: PendingFrame | PageLayers) -> None:
-        """Queue a frame, replacing a pending one of the same kind."""
+        """Queue a frame. It replaces a pending frame of the same kind."""
         self._frames[kind] = frame
         self._wake.set()
 
@@ -87,9 +87,9 @@ class PageSession:
         self._wake.set()
 
     def acknowledge(self, kind: FrameKind, sequence: int, loaded: bool = True) -> bool:
-        """Note that the client has shown frame ``sequence``; return False if it was not sent or already acknowledged.
+        """Record that the client has shown frame ``sequence``; return False if it was not sent, or acknowledged before.
 
-        ``loaded``: True if the client holds the layers of the frame from now on; else the next ones are sent in full.
+        ``loaded`` means that the client holds the frame's layers from now on. Otherwise the next ones are sent in full.
         """
         if self._unacknowledged.get(kind) != sequence:
             return False

@@ -349,7 +349,7 @@ def test_layers_that_no_page_could_render_are_a_fault_of_the_console(setup):
     assert server.layers == [version]
     node.feed.take_layers(node.feed.layers_of(build("VspaceLayers", {"version": 1}, 0)))
     assert len(server.layers) == 1
-    assert "Virtual space not shown: the layers hold no keyframe." in node.diagnoses()["layers"][1]
+    assert "Virtual space not shown: the layers contain no keyframe." in node.diagnoses()["layers"][1]
 
 
 def test_map_is_sent_when_changed_and_at_most_twice_a_second(setup):
