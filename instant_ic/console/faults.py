@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 from instant_ic.bus.clock import Clock
@@ -31,6 +32,7 @@ class FaultList:
             {"name": name, "cpu_percent": round(float(self._heartbeats[name][1].cpu_percent), 1)}
             for name in sorted(self._heartbeats)
             if self._now_s - self._heartbeats[name][0] <= TIMEOUT_S
+            and math.isfinite(self._heartbeats[name][1].cpu_percent)  # JSON has no other numbers
         ]
 
     def take_diagnoses(self, message: DiagnosticArray) -> None:

@@ -415,6 +415,7 @@ def test_health_lists_the_cpu_of_the_running_nodes(setup):
     bus, _, server = setup
     bus.publish("/heartbeat", heartbeat("nerf", NodeStatus.RUNNING, 21.26))
     bus.publish("/heartbeat", heartbeat("mine", NodeStatus.RUNNING))
+    bus.publish("/heartbeat", heartbeat("strange", NodeStatus.RUNNING, math.nan))
     bus.publish("/heartbeat", heartbeat("bag_player", NodeStatus.STOPPING))
     bus.advance(1.1)
     nodes = {node["name"]: node for node in server.texts["health"]["nodes"]}
