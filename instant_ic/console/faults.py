@@ -1,4 +1,4 @@
-"""Faults of the nodes for the operator, from diagnoses and missing heartbeats, and the nodes' CPU load."""
+"""Faults and CPU of the nodes for the operator: diagnoses and missing heartbeats."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from instant_ic.msg import DiagnosticArray, NodeStatus
 
 TIMEOUT_S = 3.0
 MAX_FAULTS = 4
-MOST_NAMES = 500  # largest number of nodes, and of diagnoses, including those of other machines
+MOST_NAMES = 500  # largest number of nodes, and of diagnoses; those of other machines count too
 OK, WARN, ERROR = 0, 1, 2  # diagnostic_msgs/DiagnosticStatus
 
 
@@ -20,7 +20,7 @@ class FaultList:
     def __init__(self, clock: Clock) -> None:
         self._clock = clock
         self._diagnoses: dict[str, tuple[int, str, float]] = {}
-        self._heartbeats: dict[str, tuple[float, NodeStatus]] = {}  # without nodes that have announced their shutdown
+        self._heartbeats: dict[str, tuple[float, NodeStatus]] = {}  # of nodes that have not announced their shutdown
 
     @property
     def _now_s(self) -> float:
@@ -46,7 +46,7 @@ class FaultList:
             self._diagnoses[status.name] = (int(status.level), status.message, now_s)
 
     def take_heartbeat(self, message: NodeStatus) -> None:
-        """Record a node's heartbeat. A node that announced its shutdown does not count as missing."""
+        """Note a node's heartbeat. A node that announced its shutdown does not count as missing."""
         if int(message.state) == NodeStatus.STOPPING:
             self._heartbeats.pop(message.node, None)
         elif message.node in self._heartbeats or len(self._heartbeats) < MOST_NAMES:
