@@ -48,7 +48,7 @@ class SpaceState(enum.IntEnum):
 
 @dataclass(frozen=True)
 class SpaceStatus:
-    """Status of the space; fields as in VspaceStatus.msg.
+    """Status of the space, from which the node fills VspaceStatus.msg.
 
     Attributes:
         state: state of the space.

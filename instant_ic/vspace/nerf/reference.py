@@ -138,7 +138,7 @@ def adam_step(field: TorchField, state: TrainState, grads: tuple[Tensor, ...], r
         step_size: float | Tensor = adam_step_size(rates[min(index, 1)], state.steps)
         if index == 0:
             step_size = step_size * state.level_rates
-        # Rows of the network without a gradient keep their values, like entries of the table.
+        # Rows of the network without a gradient keep value and moments here; the fast kernels update them too.
         adam_touched(value, grad, *state.moments[index], step_size, BETA1, BETA2, EPSILON)
 
 
@@ -319,7 +319,7 @@ def prior_agrees(prior: TorchPrior, points: Tensor) -> Tensor:
 
 
 def prior_distance(prior: TorchPrior, points: Tensor) -> Tensor:
-    """Return the distances (N,) from points in the camera's frame to the surface behind, in truncation distances."""
+    """Return signed distances (N,) of points in the camera's frame to the surface on their ray, as in ``march``."""
     nearness = prior_inverse_depth(prior, *_pixels(points, prior.inverse_depth))
     return (1 - points.norm(dim=1) * nearness) / prior.band
 
