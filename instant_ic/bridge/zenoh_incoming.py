@@ -27,6 +27,9 @@ ACTED_ON = ("*/operator/*", "*/cmd_vel", "*/robot/estop", "*/parameter_events")
 MAX_TOPICS, MAX_SOURCES, MAX_NAME = 512, 64, 200
 """Most imported topics, publishers per topic, and characters of a name: limits against a hostile ROS graph."""
 
+MAX_FRAMES = 1000
+"""Most static transforms, all of which are sent again with each new one."""
+
 MAX_PUBLISHERS = 256
 """Most publishers per topic whose gaps are counted; needed because senders choose their ids freely."""
 
@@ -106,11 +109,14 @@ class _ImportedTopic:
         """Return all static transforms so far as one message; other payloads unchanged.
 
         Raises:
-            MessageError: the bytes are not a TFMessage.
+            MessageError: the bytes are not a TFMessage, or the transforms are too many.
         """
         if self.static is None:
             return payload
-        self.static |= {each.child_frame_id: each for each in deserialize(payload, _TF).transforms}
+        static = self.static | {each.child_frame_id: each for each in deserialize(payload, _TF).transforms}
+        if len(static) > MAX_FRAMES:
+            raise MessageError(f"more than {MAX_FRAMES} static transforms")
+        self.static = static
         return serialize(message_type(_TF)(list(self.static.values())))
 
     def close(self) -> None:

@@ -1,5 +1,6 @@
 """The gateway between our bus and Zenoh: against raw Zenoh sessions, an independent client, and itself."""
 
+import itertools
 import os
 import time
 
@@ -210,6 +211,21 @@ def test_late_joiners_get_the_latched_values_of_every_node(world):
     late = world.neighbour("station", "late")
     heard = late.listen("/tf_static", LATCHED)
     late.wait(lambda: heard and frames(heard) == {"camera", "velodyne"}, "both transforms, late")
+
+
+def test_static_transforms_without_end_are_refused(world, monkeypatch):
+    monkeypatch.setattr("instant_ic.bridge.zenoh_incoming.MAX_FRAMES", 2)
+    world.gateway("robot", namespace="robot1", publish=("/tf_static",))
+    publisher = world.neighbour("robot", "camera").publisher("/tf_static", TFMessage, LATCHED)
+    station = world.gateway("station", namespace="robot1", subscribe=("/tf_static",))
+    children = itertools.count()
+
+    def refused():
+        publisher.publish(static(f"frame{next(children)}"))
+        return station.told("in /tf_static")
+
+    wait_for(refused, "the refusal")
+    assert "refused: more than 2 static transforms" in station.told("in /tf_static")
 
 
 # -- in ----------------------------------------------------------------------------------------------
