@@ -149,7 +149,7 @@ def prior_agrees(x, y, z, inverse, depth_edge, known, tolerance):  # type: ignor
 
 @njit(**_OPTIONS)
 def prior_distance(x, y, z, inverse, depth_edge, band):  # type: ignore[no-untyped-def]
-    """Return the signed distance of a point in the camera's frame to the surface on its ray, in shares of ``band``."""
+    """Return a camera-frame point's signed distance to the surface on its ray, in truncation distances."""
     height, width = inverse.shape
     flat = math.sqrt(x * x + y * y)
     u = np.float32((math.pi - math.atan2(y, x)) * (width / (2 * math.pi)) - 0.5)
