@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 
@@ -13,10 +14,28 @@ from instant_ic.console.protocol import FrameKind
 from instant_ic.control.states import Mode
 from instant_ic.geometry.poses import Matrix
 from instant_ic.geometry.transforms import TransformBuffer, TransformError
-from instant_ic.msg import ControlState, Pose, ShownPictures, header, matrix_from_pose, pose_message, to_time
+from instant_ic.msg import (
+    ControlState,
+    MessageError,
+    Pose,
+    ShownPictures,
+    header,
+    matrix_from_pose,
+    pose_message,
+    to_time,
+)
 from instant_ic.util.pace import current
 
 MODES = {int(mode): mode.label for mode in Mode}
+
+
+def finite_pose(message: Any) -> Matrix | None:
+    """Return the matrix of a message's pose; None if it is not a finite pose, so that the page gets the rest."""
+    try:
+        matrix = matrix_from_pose(message)
+    except MessageError:
+        return None
+    return matrix if np.isfinite(matrix).all() else None
 
 
 class Display:
@@ -135,14 +154,14 @@ class Display:
         """Return map_from_base of the r-bot; the arbiter's estimate if the tree has a gap."""
         pose = self.lookup("map", "base_link")
         control = self.control.message
-        return matrix_from_pose(control.robot_pose) if pose is None and control is not None else pose
+        return finite_pose(control.robot_pose) if pose is None and control is not None else pose
 
     def vbot_pose(self) -> Matrix | None:
         """Return map_from_base of the v-bot; the arbiter's estimate until the v-bot publishes its pose."""
         if self.vbot.message is not None:
-            return matrix_from_pose(self.vbot.message)
+            return finite_pose(self.vbot.message)
         control = self.control.message
-        return None if control is None else matrix_from_pose(control.vbot_pose)
+        return None if control is None else finite_pose(control.vbot_pose)
 
     def camera_mount(self) -> Matrix:
         """Return base_from_camera without rotation, because look directions are relative to the heading."""

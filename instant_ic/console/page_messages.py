@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from instant_ic.console.display import Display
+from instant_ic.console.display import Display, finite_pose
 from instant_ic.console.layers import pose_fields
 from instant_ic.geometry.poses import Matrix, pose2_from_matrix
 from instant_ic.msg import (
@@ -15,7 +15,6 @@ from instant_ic.msg import (
     Path,
     PoseStamped,
     VspaceStatus,
-    matrix_from_pose,
     path_array,
     twist_values,
 )
@@ -56,7 +55,7 @@ def plan_message(
     return {
         "trajectory": points(trajectory),
         "path": points(path) if virtual else [],
-        "subgoal": planar(matrix_from_pose(subgoal)) if virtual and subgoal is not None else None,
+        "subgoal": planar(finite_pose(subgoal)) if virtual and subgoal is not None else None,
     }
 
 

@@ -214,6 +214,17 @@ def test_virtual_mode_asks_for_the_view_from_the_vbot_where_the_operator_looks(s
     assert server.texts["state"]["vbot"] == pytest.approx([3, 2, math.pi / 2], abs=1e-3)
 
 
+def test_a_pose_that_is_no_number_costs_the_page_that_pose_alone(setup):
+    bus, _, server = setup
+    bad = build("Pose", {"position": {"x": math.nan}, "orientation": {"w": 1.0}}, 0)
+    bus.publish("/ic/state", control(bus, ControlState.VIRTUAL, robot_pose=bad, vbot_pose=bad), latched=True)
+    bus.publish("/ic/subgoal", build("PoseStamped", {"pose": {"orientation": {"w": math.nan}}}, 0))
+    bus.advance(0.3)
+    state = server.texts["state"]
+    assert (state["mode"], state["robot"], state["vbot"]) == ("virtual", None, None)
+    assert server.texts["plan"]["subgoal"] is None
+
+
 def test_only_one_request_is_outstanding_and_the_rate_follows_the_answers(setup):
     bus, _, server = setup
     publish_tree(bus)
