@@ -106,7 +106,7 @@ def evaluate_recordings(
             raise StackError(f"the stack ended with status {status}; see {out}/launch.log")
     finally:
         shutil.rmtree(run_dir, ignore_errors=True)
-    summary["depth_from"] = "scaled by the LiDAR" if same_place else "as estimated, the LiDAR was not asked"
+    summary["depth_from"] = "scaled by the LiDAR" if same_place else "as estimated, not compared with the LiDAR"
     (out / "summary.json").write_text(json.dumps(summary, indent=2) + "\n")
     return summary
 

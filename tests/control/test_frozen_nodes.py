@@ -89,14 +89,14 @@ def assert_waits_for_a_release(stack: Stack, text: str) -> None:
 def test_a_frozen_arbiter_waits_for_a_release(mode: Mode, seconds: float) -> None:
     stack = stack_in(mode)
     freeze(stack, ["arbiter"], seconds)
-    assert_waits_for_a_release(stack, "The robot's control stood still for")
+    assert_waits_for_a_release(stack, "The robot's controller paused for")
 
 
 @pytest.mark.parametrize("names", [("virtual_robot",), ALL], ids="+".join)
 def test_frozen_nodes_in_virtual_wait_for_a_release(names: tuple[str, ...]) -> None:
     stack = stack_in(Mode.VIRTUAL)
     freeze(stack, names, 2.0)
-    assert_waits_for_a_release(stack, "stood still for" if "arbiter" in names else "")
+    assert_waits_for_a_release(stack, "paused for" if "arbiter" in names else "")
 
 
 @pytest.mark.parametrize("mode", [Mode.REAL, Mode.RETURNING])
@@ -169,7 +169,7 @@ def test_silence_after_a_held_key_is_no_release() -> None:
     freeze(stack, ["arbiter"], 2.0)
     stack.drive(0.5, KEY)
     assert {state.mode for state in stack.drive(2.0, None)} == {Mode.STOPPED}
-    assert_waits_for_a_release(stack, "stood still")
+    assert_waits_for_a_release(stack, "paused")
 
 
 def test_a_single_zero_of_a_page_that_comes_back_is_no_release() -> None:
@@ -240,7 +240,7 @@ def test_the_first_step_after_a_freeze_stops_whatever_it_handles_first(order: st
         arbiter.on_timer()
     stack.operate((0.3, 0.0))
     assert commands(stack, since)[0] == NOTHING
-    assert_waits_for_a_release(stack, "stood still for 2.0 s")
+    assert_waits_for_a_release(stack, "paused for 2.0 s")
 
 
 def test_gaps_count_in_steps_of_the_process_and_in_time_of_suspend() -> None:

@@ -233,7 +233,7 @@ def test_rendering_agrees_with_the_reference(scene):
 
 
 def test_other_geometries_are_refused():
-    with pytest.raises(ValueError, match="distance only"):
+    with pytest.raises(ValueError, match="only distance"):
         TritonDevice(FieldConfig(geometry="density"), TRAIN, DEVICE)
 
 
