@@ -21,7 +21,6 @@ import time
 from multiprocessing.connection import Connection
 from typing import Any
 
-import numpy as np
 from reporting import parser_for, report, summary
 
 from instant_ic.console import ConsoleBackend, ConsoleClient, ConsoleServer, ConsoleServerConfig
@@ -145,7 +144,7 @@ async def drive(port: int, seconds: float) -> tuple[list[float], list[float]]:
     trips, stops = [], []
     async with ConsoleClient(f"http://127.0.0.1:{port}/") as driver:
         await driver.acquire()
-        driver.beats.cancel()  # stop the client's own heartbeat; this function sends it
+        driver.silence()  # this function sends the heartbeat
         end_s = time.monotonic() + seconds
         while time.monotonic() < end_s:
             sent_s = time.monotonic()
@@ -184,7 +183,8 @@ def measure(kind: str | None, clients: int, seconds: float, address: str) -> dic
         ours.send(None)
         came = ours.recv()
         assert len(came) == len(sent), f"{len(sent)} stops were sent, {len(came)} came"
-        result |= {"round_trip": summary(np.multiply(1000, trips)), "stop": summary(1000 * np.subtract(came, sent))}
+        waits = [1000 * (at - since) for at, since in zip(came, sent, strict=True)]
+        result |= {"round_trip": summary([1000 * trip for trip in trips]), "stop": summary(waits)}
     finally:
         server.join(10)
         server.kill()

@@ -157,7 +157,8 @@ def train(run: GpuRun) -> dict[str, Any]:
 
 def views(run: GpuRun) -> dict[str, Any]:
     """Time the first view after a keyframe and views a second, of the field and of the panorama's warp."""
-    place, result = SimulatedPlace(run.worlds[0], run.view), {}
+    place = SimulatedPlace(run.worlds[0], run.view)
+    result: dict[str, Any] = {}
     first_keyframe, keyframe = place.keyframe(-0.3), place.keyframe(0.0)
     pose = place.start @ pose_matrix(1.0, 0.1, yaw=0.1)
     for device in run.devices:
@@ -260,8 +261,8 @@ def main() -> int:
     run = GpuRun(("cuda",), args.seconds, args.worlds.split(","))
     if args.cpu:
         torch.set_num_threads(1)
-        small = {"view": (320, 180), "clock": time.process_time, "train": TrainConfig(iterations=1000)}
-        run = dataclasses.replace(run, devices=("cpu",), **small)
+        small = TrainConfig(iterations=1000)
+        run = dataclasses.replace(run, devices=("cpu",), view=(320, 180), clock=time.process_time, train=small)
     args.out.mkdir(parents=True, exist_ok=True)
     machine = "CPU" if args.cpu else torch.cuda.get_device_name()
     failed = False

@@ -220,7 +220,7 @@ class PageDrive:
         self._page.keyboard.up(key)
         pressed_ms = self._page.evaluate("window.__keys.at(-1)[1]")
         observer.subscriptions.remove(subscription)
-        subscription.close()
+        subscription.raw.close()
         return moving[0] / 1e6 - float(pressed_ms)
 
 

@@ -423,11 +423,6 @@ async def press_shortly(rig: Rig, page: ConsoleClient) -> None:
     rig.serial.pressed = False
 
 
-def silence_page(rig: Rig, page: ConsoleClient) -> None:
-    for task in page._tasks:
-        task.cancel()
-
-
 FAULTS = [
     *(fault for node in PROCESSES for fault in (freeze(f"{node} frozen", [node]), kill(node))),
     second_console_fault(),
@@ -442,7 +437,7 @@ FAULTS = [
     Fault("robot's stop button pressed for 0.06 s", press_shortly, release_estop),
     Fault("key let go (no loss; soft ramp)", lambda rig, page: page.stop()),
     Fault("page closed", lambda rig, page: page.close()),
-    Fault("page silent", silence_page),
+    Fault("page silent", lambda rig, page: page.silence()),
     Fault("page link cut", lambda rig, page: rig.page_link.cut(), lambda rig, page: rig.page_link.mend()),
     Fault("camera link cut", lambda rig, page: rig.camera_link.cut(), lambda rig, page: rig.camera_link.mend()),
     relay_fault("LiDAR packets cease", "packets", "cut", True, False),

@@ -64,7 +64,7 @@ class ConsoleClient:
         self._command = (0.0, 0.0)
         self._http: aiohttp.ClientSession | None = None
         self.socket: aiohttp.ClientWebSocketResponse | None = None
-        self.beats: asyncio.Task[None] | None = None
+        self._beats: asyncio.Task[None] | None = None
         self._reader: asyncio.Task[None] | None = None
         self._news = asyncio.Condition()
 
@@ -94,12 +94,17 @@ class ConsoleClient:
         except BaseException:
             await self._http.close()
             raise
-        self._reader, self.beats = asyncio.create_task(self._read()), asyncio.create_task(self._beat())
+        self._reader, self._beats = asyncio.create_task(self._read()), asyncio.create_task(self._beat())
         await self.wait_for(lambda c: {"hello", "pong"} <= c.messages.keys(), timeout_s)
+
+    def silence(self) -> None:
+        """Send no heartbeats and commands any more, as a page whose script hangs."""
+        if self._beats is not None:
+            self._beats.cancel()
 
     async def close(self) -> None:
         """Stop and disconnect."""
-        tasks = [task for task in (self._reader, self.beats) if task is not None]
+        tasks = [task for task in (self._reader, self._beats) if task is not None]
         for task in tasks:
             task.cancel()
         await asyncio.gather(*tasks, return_exceptions=True)

@@ -110,7 +110,7 @@ async def test_the_loss_of_the_driver_is_told_at_once(serve, how):
     async with ConsoleClient(server.url) as client:
         await client.acquire()
         await server.backend.wait(lambda b: b.operator[:1] == [True])
-        client.beats.cancel()  # the beats
+        client.silence()
         await server.backend.wait(lambda b: b.operator[-1] is False)
         if how != "silent":
             told = len(server.backend.operator)
