@@ -117,7 +117,7 @@ class NavigatorNode(Node[NavigatorConfig]):
         grid, goal = self.costmap.fresh, self.subgoal.fresh
         if grid is None or goal is None:
             missing = "costmap" if grid is None else "subgoal"
-            self.diagnose("follow", WARN, f"The {missing} has timed out. The robot stands")
+            self.diagnose("follow", WARN, f"There is no recent {missing}. The robot stands.")
             return 0.0, 0.0
         age_s = (self.clock.now_ns() - msg.stamp_ns(state)) / 1e9
         pose = extrapolate(msg.pose2_from_message(state.robot_pose), msg.twist_values(state.robot_twist), age_s)

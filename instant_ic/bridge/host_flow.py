@@ -142,7 +142,7 @@ class _Outgoing:
 
     @property
     def queued(self) -> bool:
-        """True if every message is sent, unless the other side requested a lower rate."""
+        """True if every message is kept until it is sent; False if only the newest is."""
         return self.channel.queued and not self.period_ns
 
 

@@ -14,7 +14,7 @@ from instant_ic.bus import RELIABLE, SENSOR, registry
 from instant_ic.bus.diagnostics import ERROR, OK, WARN
 from instant_ic.bus.heartbeat import EVERY_NODES, TYPE, Heartbeat, from_message
 from instant_ic.bus.local_transport import LocalTransport
-from instant_ic.launch.topics import expected_rate
+from instant_ic.launch.topics import PAUSE_S, expected_rate
 from instant_ic.msg import MessageError, deserialize, header, message_type, serialize
 from instant_ic.util.paths import sign_in_file
 
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from instant_ic.bus.transport import RawSubscription
     from instant_ic.launch.description import NodeSpec
 
-FAULT_HOLDS_S = 3.0
+FAULT_HOLDS_S = PAUSE_S
 """Time for which a rate must be wrong before it is reported."""
 
 _VSPACE_READY = 2

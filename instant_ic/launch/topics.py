@@ -12,6 +12,9 @@ from instant_ic.util import paths
 ALIVE_PERIODS = 10.0
 """Age of the newest message, in nominal periods, above which a topic counts as stopped."""
 
+PAUSE_S = 3.0
+"""Age in seconds above which a topic with a condition counts as paused; a rate is reported after as long."""
+
 FREQ_OK_SHARE = 0.9
 """Share of the nominal rate above which a measured rate is right."""
 
@@ -43,9 +46,9 @@ class TopicRate:
             rate_hz: measured rate.
             age_s: age of the newest message; inf before the first.
         """
+        if self.when and (age_s > PAUSE_S or not self.alive(age_s)):  # a pause is normal
+            return ""
         if not self.alive(age_s):
-            if self.when:  # a pause is normal
-                return ""
             return "no message yet" if math.isinf(age_s) else f"stopped {age_s:.1f} s ago"
         if not self.freq_ok(rate_hz):
             return f"{rate_hz:.1f} of {self.rate_hz:g} Hz"

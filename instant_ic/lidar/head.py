@@ -21,7 +21,7 @@ _SAME_EDGE_CDEG = 200
 
 @dataclass(frozen=True)
 class Sector:
-    """Directions from ``start`` clockwise over ``width``, 0.01 degrees."""
+    """Directions from ``start`` clockwise over ``width``, both in hundredths of a degree."""
 
     start: int
     width: int

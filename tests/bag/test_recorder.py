@@ -298,7 +298,7 @@ def test_a_snapshot_ends_after_its_time_and_takes_more_than_the_queue_holds(tmp_
     assert [payload[0] for _, _, payload in read(snapshot.path)] == [1, 2, 3, 4] and not recorder.failed
 
 
-def test_a_snapshot_waits_for_no_disk_and_one_that_cannot_be_written_is_told(
+def test_a_snapshot_waits_for_no_disk_and_after_one_that_cannot_be_written_the_next_succeeds(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     recorder, disk = recorder_of(tmp_path / "snaps", snapshot=True), SlowDisk(monkeypatch)
@@ -310,10 +310,14 @@ def test_a_snapshot_waits_for_no_disk_and_one_that_cannot_be_written_is_told(
     disk.go.set()
     wait_for(lambda: first.done and another.done, "the snapshots")
     assert not first.error and not another.error and first.path != another.path
-    monkeypatch.setattr("instant_ic.bag.writer.make_folder", refuse_folder)
-    second = recorder.snapshot("refused")
-    wait_for(lambda: second.done, "the refusal")
+    with monkeypatch.context() as patch:
+        patch.setattr("instant_ic.bag.writer.make_folder", refuse_folder)
+        second = recorder.snapshot("refused")
+        wait_for(lambda: second.done, "the refusal")
     assert "cannot be created: Permission denied" in second.error and recorder.failed
+    third = recorder.snapshot("written")
+    wait_for(lambda: third.done, "the snapshot after it")
+    assert not third.error and [payload for _, _, payload in read(third.path)] == [b"1"]
     with pytest.raises(BagError, match="Permission denied"):
         recorder.close()
 

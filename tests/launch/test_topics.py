@@ -25,6 +25,8 @@ ROOT = Path(__file__).resolve().parents[2]
         (TopicRate(10.0, "driving"), 0.0, math.inf, ""),
         (TopicRate(10.0, "driving"), 0.0, 60.0, ""),
         (TopicRate(10.0, "driving"), 5.0, 0.2, "5.0 of 10 Hz"),
+        (TopicRate(1.0, "a page is open"), 0.4, 2.5, "0.4 of 1 Hz"),
+        (TopicRate(1.0, "a page is open"), 0.0, 3.5, ""),  # the page was closed
     ],
 )
 def test_fault(expected: TopicRate, rate_hz: float, age_s: float, words: str) -> None:
