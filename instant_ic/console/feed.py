@@ -14,14 +14,14 @@ from instant_ic.bus.topics import Latest
 from instant_ic.console import page_messages as page
 from instant_ic.console.backend import PageServer
 from instant_ic.console.config import ConsoleConfig
-from instant_ic.console.display import Display
+from instant_ic.console.display import Display, finite_pose
 from instant_ic.console.faults import ERROR, OK, WARN, FaultList
 from instant_ic.console.gridimage import grid_image
 from instant_ic.console.layers import MOST_LAYERS, LayerMeshes, PageLayers
 from instant_ic.console.protocol import FrameKind, PendingFrame
 from instant_ic.console.server import PLAIN_HTTP
 from instant_ic.console.view import ViewSchedule
-from instant_ic.msg import grid_array, header, matrix_from_pose, pose_message, stamp_ns
+from instant_ic.msg import grid_array, header, pose_message, stamp_ns
 from instant_ic.util.pace import current
 
 IMAGE_TIMEOUT_S = 2.0
@@ -91,17 +91,17 @@ class PageFeed:
 
     def take_view(self, message: msg.RenderedView) -> None:
         """Forward a rendered view, then request the next one."""
-        if not (0 < message.fov_rad < math.pi):
-            self._diagnose(
-                "view", ERROR, f"View not shown: its field of view is {message.fov_rad:.3g} rad. Restart nerf."
-            )
+        pose = finite_pose(message.pose)
+        if pose is None or not (0 < message.fov_rad < math.pi):
+            wrong = "pose is not finite" if pose is None else f"field of view is {message.fov_rad:.3g} rad"
+            self._diagnose("view", ERROR, f"View not shown: its {wrong}. Restart nerf.")
             return
         request_id = int(message.request_id)
         delay_s = self.views.answered(request_id, self._clock.steady_ns())
         if delay_s is not None:
             self.display.take_view(request_id, delay_s, message.pose)
             self.report_shown()
-            fields = page.image_header(self._captured_ms(stamp_ns(message)), matrix_from_pose(message.pose))
+            fields = page.image_header(self._captured_ms(stamp_ns(message)), pose)
             self.server.send_frame(FrameKind.VIEW, fields | {"fov": float(message.fov_rad)}, bytes(message.image.data))
         self._request_view()
 

@@ -225,6 +225,19 @@ def test_a_pose_that_is_no_number_costs_the_page_that_pose_alone(setup):
     assert server.texts["plan"]["subgoal"] is None
 
 
+def test_a_view_from_a_pose_that_is_no_number_is_not_shown_and_the_next_one_is(setup):
+    bus, _, server = setup
+    publish_tree(bus)
+    bus.publish("/ic/state", control(bus, ControlState.VIRTUAL), latched=True)
+    bus.advance(0.06)
+    good = view_message(bus, bus.last("/view/request").id)
+    bad = build("Pose", {"position": {"x": math.nan}, "orientation": {"w": 1.0}}, 0)
+    bus.publish("/vspace/view", dataclasses.replace(good, pose=bad))
+    assert FrameKind.VIEW not in {kind for kind, _, _ in server.frames}
+    bus.publish("/vspace/view", good)
+    assert server.frames[-1][0] == FrameKind.VIEW
+
+
 def test_only_one_request_is_outstanding_and_the_rate_follows_the_answers(setup):
     bus, _, server = setup
     publish_tree(bus)
