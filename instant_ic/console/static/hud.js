@@ -121,14 +121,15 @@ export function showBanner(link, lease, state) {
   byId("release").hidden = !shown.release;
 }
 
-let announceTimer = 0;
+/** @type {Map<string, number>} */
+const announceTimers = new Map();
 /**
  * Announces a text to screen readers after ANNOUNCE_MS unless another one replaces it, so that short changes stay silent.
- * @param {string} text
+ * @param {string} text @param {string} id element of the subject, because a text replaces only one of the same subject
  */
-export function announce(text) {
-  clearTimeout(announceTimer);
-  announceTimer = setTimeout(() => write(byId("announce"), text), ANNOUNCE_MS);
+export function announce(text, id = "announce") {
+  clearTimeout(announceTimers.get(id));
+  announceTimers.set(id, setTimeout(() => write(byId(id), text), ANNOUNCE_MS));
 }
 
 let toastTimer = 0;

@@ -41,7 +41,7 @@ export class Recording {
     const { recorder, state, path, text, free_bytes, cached_s, notice } = this._status = status;
     if (this._notice !== null && notice.number !== this._notice) toast(notice.text);
     this._notice = notice.number;
-    if (document.body.dataset.recording !== state) announce(state === "recording" ? "Recording" : recorderText(state));
+    if (document.body.dataset.recording !== state) announce(state === "recording" ? "Recording" : recorderText(state), "announce-record");
     mark("recording", state);
     const button = byId("record"), shown = recordText(status);
     write(byId("record-text"), shown);
